@@ -20,10 +20,9 @@ from pydantic.fields import FieldInfo
 from typer.cli import get_docs_for_click
 
 from sononerf import __version__
-from sononerf.cli.entry import app as cli
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.cli.app import complete
 from sononerf.settings.schema import Settings
-from sononerf.settings.section import Section
+from sononerf.settings.sections import ImportSettings, Section
 
 sys.path.insert(0, str(Path(__file__).parent))
 import house
@@ -48,7 +47,7 @@ toc_object_entries = False
 
 def commands() -> str:
     """Return the page of all commands, in Markdown."""
-    command = typer.main.get_command(cli)
+    command = typer.main.get_command(complete())
     context = typer.Context(command)
     page = get_docs_for_click(obj=command, ctx=context, name="sononerf")
     page = page.partition("## `")[1] + page.partition("## `")[2]

@@ -12,7 +12,8 @@ from numpy.polynomial.legendre import legval
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import EDGE, SIDE, Degrees, placed
 from .lathe import lathe

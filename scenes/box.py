@@ -3,7 +3,8 @@
 
 import trimesh
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, Length, placed
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A capsule: a rod with round ends, curved one way."""
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, Length, Radius, placed, tube
 

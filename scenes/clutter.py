@@ -10,8 +10,8 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene import Scene
 from sononerf.scene.composition import Part, compose
+from sononerf.scene.scene import Scene
 
 from .bodies import ball, rounded
 from .composed import OWN, load_within

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import SIDE, Degrees, Length, Radius, Wire, placed
 from .loft import loft

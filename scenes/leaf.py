@@ -8,7 +8,8 @@ import trimesh
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .blade import Blade
 from .bodies import EDGE, Degrees, turned

@@ -11,7 +11,8 @@ import trimesh
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, placed, tube
 

@@ -6,7 +6,8 @@ from typing import Annotated
 import trimesh
 from pydantic import Field
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, Length, placed
 

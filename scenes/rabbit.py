@@ -8,7 +8,8 @@ import trimesh
 from pydantic import Field
 
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, ball, placed
 

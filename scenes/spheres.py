@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 
 def spheres(

@@ -7,7 +7,8 @@ import numpy as np
 import trimesh
 from pydantic import Field
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, Length, Radius, placed, walls
 

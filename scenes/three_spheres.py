@@ -5,7 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sononerf.scene import MaterialName, Scene
+from sononerf.scene.material import MaterialName
+from sononerf.scene.scene import Scene
 
 from .spheres import spheres
 

@@ -6,7 +6,8 @@ import math
 import trimesh
 
 from sononerf.errors import SettingsError
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import Degrees, Radius, placed, sections
 

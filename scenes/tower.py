@@ -10,7 +10,8 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.material import MATERIALS, MaterialName
+from sononerf.scene.scene import Scene
 
 from .bodies import SIDE, Degrees, Length, placed
 

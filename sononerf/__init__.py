@@ -12,7 +12,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sononerf.display import show_by
-from sononerf.version import __version__
 
 if TYPE_CHECKING:
     from sononerf.echoes.echoes import Echoes
@@ -25,15 +24,15 @@ if TYPE_CHECKING:
     from sononerf.field.renderer import Renderer
     from sononerf.geometry.poses import Poses
     from sononerf.head.head import Head
-    from sononerf.run.compare import compare
+    from sononerf.refinement.reconstruction import reconstruct, refine
+    from sononerf.refinement.surface_error import next_poses
+    from sononerf.run.evaluate import compare
     from sononerf.run.import_recordings import read_recordings
     from sononerf.run.run import Run, open_run
     from sononerf.scene.material import Material
     from sononerf.scene.scene import Scene
     from sononerf.simulation.ensemble import simulate
-    from sononerf.surface.next_poses import next_poses
-    from sononerf.surface.reconstruction import reconstruct, refine
-    from sononerf.surface.surface import Surface
+    from sononerf.start.surface import Surface
 
 __all__ = [
     "Comparison",
@@ -63,6 +62,8 @@ __all__ = [
     "simulate",
 ]
 
+__version__ = "0.2.0.dev0"
+
 _HOMES = {
     "Comparison": "evaluation.numbers",
     "EchoDataModule": "field.datamodule",
@@ -77,16 +78,16 @@ _HOMES = {
     "Renderer": "field.renderer",
     "Run": "run.run",
     "Scene": "scene.scene",
-    "Surface": "surface.surface",
-    "compare": "run.compare",
+    "Surface": "start.surface",
+    "compare": "run.evaluate",
     "evaluate": "evaluation.numbers",
     "fit": "field.fitting",
-    "next_poses": "surface.next_poses",
+    "next_poses": "refinement.surface_error",
     "open_run": "run.run",
     "predict": "evaluation.prediction",
     "read_recordings": "run.import_recordings",
-    "reconstruct": "surface.reconstruction",
-    "refine": "surface.reconstruction",
+    "reconstruct": "refinement.reconstruction",
+    "refine": "refinement.reconstruction",
     "simulate": "simulation.ensemble",
 }
 """Modules of the public names; each is imported at its first use."""
@@ -106,7 +107,7 @@ def _notebook(name: str) -> Any:
     """Return a function of the notebook's module, which imports all kinds of objects, when used."""
 
     def call(*given: Any, **options: Any) -> Any:
-        return getattr(importlib.import_module("sononerf.report.notebook"), name)(*given, **options)
+        return getattr(importlib.import_module("sononerf.report.page"), name)(*given, **options)
 
     return call
 

@@ -23,21 +23,17 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sononerf import storage
 from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.field.datamodule import WholePoses
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule, decibels
-from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.lattice import Volume, automatic_level, isosurface
 from sononerf.progress import Task
-from sononerf.report.pictures.figure import png_from_pixels
-from sononerf.report.pictures.mip_picture import (
-    maximum_intensity_projections,
-    mip_image,
-    mips_image,
-)
-from sononerf.report.pictures.spectrogram_picture import quick_image, sounding_slice
-from sononerf.report.surface_views import decimated
-from sononerf.surface.mesh_files import mesh_bytes
-from sononerf.surface.start.read_out import energy_volume
+from sononerf.report.figure import png_from_pixels
+from sononerf.report.mesh_picture import decimated
+from sononerf.report.mip_picture import maximum_intensity_projections, mip_image, mips_image
+from sononerf.report.spectrogram_picture import quick_image, sounding_slice
+from sononerf.start.read_out import energy_volume
+from sononerf.start.surface import mesh_bytes
 
 
 class ProgressCallback(lightning.Callback):

@@ -45,7 +45,7 @@ class Shown:
 
 
 def picture_of(thing: object, **options: Any) -> Picture:
-    """Return the picture of an object, see :func:`sononerf.report.notebook.png_of`."""
+    """Return the picture of an object, see :func:`sononerf.report.page.png_of`."""
     return Picture(_displays["picture"](thing, **options))
 
 

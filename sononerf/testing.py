@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sononerf.field.factories import FieldFactory, RendererFactory, make
 from sononerf.field.field import Field
+from sononerf.field.module import FieldFactory, RendererFactory, make
 from sononerf.field.renderer import Renderer
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.settings import plugins
+from sononerf.settings import loading
 
 REGION = torch.tensor([[-0.02, -0.02, -0.02], [0.02, 0.02, 0.03]])
 """Box of the tests, m."""
@@ -44,7 +44,7 @@ def check_scene(scene: str | Callable[..., Scene], **options: Any) -> Scene:
     def made() -> Scene:
         if isinstance(scene, str):
             return load_scene(scene, options)
-        return scene(**plugins.check_options(scene, options, where="scene.options"))
+        return scene(**loading.check_options(scene, options, where="scene.options"))
 
     first, second = made(), made()
     _holds(isinstance(first, Scene), f"makes a {type(first).__name__}, expected a sononerf Scene")

@@ -7,7 +7,7 @@ import numpy as np
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.layout import SPLITS
+from sononerf.echoes.memory_ensemble import SPLITS
 
 
 class MemoryStore:

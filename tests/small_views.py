@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
+from sononerf.report.mesh_picture import confidence_png, mesh_png, side_by_side_png
 
 
 def draw_small(patch: pytest.MonkeyPatch) -> None:

@@ -26,9 +26,10 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf import __version__, callbacks, storage
-from sononerf.cli import entry, start
+from sononerf.cli import __main__ as command
+from sononerf.cli import app as application
 from sononerf.evaluation import baseline
-from sononerf.evaluation import geometry as geometry_module
+from sononerf.evaluation import numbers as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.run import fit as fit_module
 from sononerf.settings.loading import read_yaml
@@ -60,7 +61,7 @@ def run(*arguments):
         patch.setattr(sys, "argv", ["sononerf", *map(str, arguments)])
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             with pytest.raises(SystemExit) as caught:
-                start.main()
+                command.main()
     return SimpleNamespace(code=caught.value.code or 0, out=out.getvalue(), err=err.getvalue())
 
 
@@ -735,7 +736,7 @@ def test_help(command):
 
 
 def test_all_commands_are_here():
-    assert sorted(typer.main.get_command(entry.app).commands) == sorted(COMMANDS)
+    assert sorted(typer.main.get_command(application.complete()).commands) == sorted(COMMANDS)
 
 
 def test_nothing_and_nonsense_are_wrong_usage():

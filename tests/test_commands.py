@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from sononerf.head.call import call_waveform
-from sononerf.recordings.audio import wav_bytes
+from sononerf.recordings.recording import wav_bytes
 from sononerf.settings.schema import CallSettings
 from tests.command import succeed
 

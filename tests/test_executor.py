@@ -15,9 +15,8 @@ import pytest
 import sononerf
 from sononerf import progress
 from sononerf.errors import NumericalError, ResourceError
-from sononerf.executor import TaskError, computed
-from sononerf.memory import available_memory, require_disk, require_memory
 from sononerf.progress import Progress
+from sononerf.resources import TaskError, available_memory, computed, require_disk, require_memory
 
 TASKS = {number: (number,) for number in range(6)}
 
@@ -92,7 +91,7 @@ def test_a_script_without_a_guard_starts_workers(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "print('begun')\n"
-        "from sononerf.executor import computed\n"
+        "from sononerf.resources import computed\n"
         "import operator\n"
         "print(sorted(computed(operator.add, 1, {2: (2,), 3: (3,)}, 2)))\n"
     )

@@ -34,11 +34,10 @@ from sononerf.geometry.poses import Poses
 from sononerf.matlab_files import numbers, opened, read_mat
 from sononerf.recordings.readers import read_airsas, read_numpy
 from sononerf.report.page import Page
-from sononerf.run.build import read_truth
-from sononerf.run.model_files import read_mesh
+from sononerf.run.build import read_mesh, read_truth
 from sononerf.scene.scene import load_scene
-from sononerf.settings.import_schema import ImportSettings
 from sononerf.settings.loading import load_settings, read_yaml
+from sononerf.settings.sections import ImportSettings
 from sononerf.storage import commit_text, lock, read_json, read_wav, require_regular
 from tests.matlab_writer import write_new
 

@@ -58,11 +58,11 @@ def test_the_manual_builds_without_warnings_and_loads_nothing_from_the_network(b
 @pytest.mark.slow
 def test_the_manual_states_every_command_setting_and_public_name(built):
     import sononerf
-    from sononerf.cli.entry import app
+    from sononerf.cli.app import complete
     from sononerf.settings.schema import Settings
 
     commands = (built / "commands.html").read_text(encoding="utf-8")
-    for name in typer.main.get_command(app).commands:
+    for name in typer.main.get_command(complete()).commands:
         assert f">sononerf {name}<" in re.sub(r"</?(code|span)[^>]*>", "", commands)
     settings = (built / "settings.html").read_text(encoding="utf-8")
     for name in Settings.model_fields:

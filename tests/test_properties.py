@@ -19,9 +19,9 @@ from sononerf.errors import SonoNerfError
 from sononerf.geometry.poses import Poses, euler_from_rotation, rotation_from_euler
 from sononerf.head.decibels import compress, expand
 from sononerf.recordings.pose_tables import columns_of, read_table, to_poses
-from sononerf.settings.import_schema import ImportSettings
 from sononerf.settings.loading import apply_override, dump_yaml, load_settings
 from sononerf.settings.schema import Settings
+from sononerf.settings.sections import ImportSettings
 from sononerf.storage import commit, commit_json, read_json
 
 settings.register_profile("suite", max_examples=40, deadline=None, derandomize=True, database=None,

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 import typer
 
-from sononerf.cli.entry import app
+from sononerf.cli.app import complete
 from sononerf.run.scenes import new_plugin
-from sononerf.settings.loading import load_settings
-from sononerf.settings.plugins import SCENES as GROUP
-from sononerf.settings.plugins import check_options, load, registered
+from sononerf.settings.loading import SCENES as GROUP
+from sononerf.settings.loading import check_options, load, load_settings, registered
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -49,7 +48,7 @@ def targets():
 
 def parse(words):
     """Let the command line read a command without running it; return its parameters."""
-    group = typer.main.get_command(app)
+    group = typer.main.get_command(complete())
     name, *arguments = words
     assert name in group.commands, f"no command {name}"
     return group.commands[name].make_context(name, arguments).params

@@ -13,11 +13,12 @@ from scipy.spatial import cKDTree
 from sononerf_scenes.bodies import EDGE
 
 from sononerf.errors import InputError, SettingsError
-from sononerf.evaluation.solid import Solid
+from sononerf.evaluation.metrics import Solid
 from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.composition import surfaces_cross
-from sononerf.scene.scene import MATERIALS, list_scenes, load_scene
-from sononerf.settings import plugins
+from sononerf.scene.material import MATERIALS
+from sononerf.scene.scene import list_scenes, load_scene
+from sononerf.settings import loading
 from sononerf.testing import check_scene
 
 NEEDY = ("composed", "mesh")  # scenes that need an option
@@ -32,7 +33,7 @@ def load(name, **options):
 
 
 def options_of(name):
-    return {row["name"] for row in plugins.describe_options(plugins.load(plugins.SCENES, name))}
+    return {row["name"] for row in loading.describe_options(loading.load(loading.SCENES, name))}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -14,8 +14,8 @@ import sononerf as sn
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.fitting import quiet_lightning
 from sononerf.progress import Progress
-from sononerf.surface import reconstruction
-from sononerf.surface.refine.refinement import Refinement
+from sononerf.refinement import reconstruction
+from sononerf.refinement.refine import Refinement
 from tests.run.test_refine import SHORT
 
 QUIET = Progress(quiet=True)

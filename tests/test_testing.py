@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from sononerf import testing
-from sononerf.field.grid import GridField
+from sononerf.field.fields import GridField
 from sononerf.field.profile import ProfileRenderer
 from sononerf.scene.scene import Scene
 

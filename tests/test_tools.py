@@ -17,8 +17,8 @@ import trimesh
 from sononerf.errors import InputError
 from sononerf.geometry.lattice import Lattice
 from sononerf.settings.loading import load_settings
-from sononerf.surface.start.features import FEATURES
-from sononerf.surface.start.network import StartNetwork
+from sononerf.start.features import FEATURES
+from sononerf.start.network import StartNetwork
 from tools.benchmarks import exact, foreign
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.step import PAIRS

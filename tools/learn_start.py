@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of this checkout
 
 from sononerf.errors import InputError  # noqa: E402
-from sononerf.surface.start.network import WEIGHTS, trained_network  # noqa: E402
+from sononerf.start.network import WEIGHTS, trained_network  # noqa: E402
 from tools.learning.examples import make_example  # noqa: E402
 from tools.learning.training import SIDE, train, weights_file  # noqa: E402
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sononerf.cli.options import (
+from sononerf.cli.app import (
     Config,
     Figures,
     FrameName,
@@ -43,7 +43,7 @@ def _begin(settings: Settings, workers: int | None) -> None:
     if sys.stderr.isatty():  # elsewhere an error message stays the only line
         say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
     if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
-        from sononerf.executor import begin, preload
+        from sononerf.resources import begin, preload
 
         preload("sononerf.simulation.ready")
         begin()
@@ -348,7 +348,7 @@ def compare(
     """Show what is heard in RUN_A and not in RUN_B, and where: a prey on a leaf."""
     from sononerf import storage
     from sononerf.progress import Progress
-    from sononerf.run.compare import compare_runs
+    from sononerf.run.evaluate import compare_runs
 
     folder = compare_runs(run_a, run_b, output=output, accelerator=accelerator, progress=Progress())
     comparison = storage.read_json(folder / "comparison.json")
@@ -396,7 +396,7 @@ def table(
     ] = None,
 ) -> None:
     """Print the numbers of runs beside one another."""
-    from sononerf.run.compare import table as table_of_runs
+    from sononerf.run.evaluate import table as table_of_runs
 
     for line in table_of_runs(runs, csv=csv):
         typer.echo(line)

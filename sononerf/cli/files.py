@@ -8,17 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sononerf.cli.options import (
-    Exported,
-    InFrame,
-    Json,
-    Overrides,
-    Run,
-    Within,
-    app,
-    print_json,
-    say,
-)
+from sononerf.cli.app import Exported, InFrame, Json, Overrides, Run, Within, app, print_json, say
 from sononerf.errors import SettingsError
 
 

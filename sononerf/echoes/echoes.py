@@ -16,15 +16,21 @@ from scipy.spatial import cKDTree
 
 from sononerf import storage
 from sononerf.display import Picture, Shown, picture_of
-from sononerf.echoes.detection import Onsets, asked_poses, find_onsets, seal_recorded
+from sononerf.echoes.detection import (
+    Onsets,
+    RangeLevels,
+    asked_poses,
+    evenly_chosen,
+    find_onsets,
+    seal_recorded,
+)
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, repeats, seal, split_of
-from sononerf.echoes.range_levels import RangeLevels, evenly_chosen
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError, expect
 from sononerf.geometry.poses import Poses
-from sononerf.head.call_file import attach, attached
+from sononerf.head.call import attach, attached
 from sononerf.head.decibels import active_level
 from sononerf.head.head import Head
 from sononerf.numerics import Floats, Ints, Singles

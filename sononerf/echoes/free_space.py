@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.numerics import Bools, Floats, compiled
 
 UNDETECTED = 0.05

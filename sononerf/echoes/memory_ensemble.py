@@ -6,6 +6,7 @@ Repeated pings of one pose stay together in training, validation or test.
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Literal
@@ -13,14 +14,52 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.echoes.layout import SPLITS, checked_axes, plain_attributes
+from sononerf import storage
 from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import RANGE_DB, active_level, compress, mae_db
 from sononerf.numerics import Floats, Ints, Singles
 
+SPLITS = {"train": 0, "val": 1, "test": 2}
 TRAIN, VALIDATION, TEST = 0, 1, 2
+AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
+    # name: type, dimension names, sizes after the first
+    "position": ("float64", ("pose", "world"), (3,)),
+    "rotation": ("float64", ("pose", "world", "head"), (3, 3)),
+    "split": ("int8", ("pose",), ()),
+    "range": ("float64", ("range",), ()),
+    "frequency": ("float64", ("frequency",), ()),
+}
+RESERVED = ("format", "schema_version")
 SAME_PLACE, SAME_TURN = 1e-6, 1e-6  # m and no unit: of one pose, printed twice
+
+
+def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
+    """Return axes in the types that are stored, by the names of :data:`AXES`."""
+    axes: dict[str, NDArray[Any]] = {}
+    for name, (dtype, dims, sizes) in AXES.items():
+        raw = np.asarray(given[name], dtype=np.float64)
+        if raw.ndim != len(dims) or raw.shape[1:] != sizes or not raw.size:
+            raise InputError(f"{name}: shape {raw.shape}, expected ({dims[0]}, *{sizes})")
+        if not np.isfinite(raw).all():
+            raise NumericalError(f"{name}: holds NaN or infinite values")
+        axes[name] = raw.astype(dtype)
+    if not np.isin(given["split"], list(SPLITS.values())).all():
+        raise InputError("split: expected 0 (train), 1 (validation) or 2 (test)")
+    lengths = [len(axes[name]) for name in ("position", "rotation", "split")]
+    if len(set(lengths)) > 1:
+        raise InputError(f"position, rotation and split differ in length: {lengths}")
+    return axes
+
+
+def plain_attributes(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
+    """Return attributes as JSON would give them back, sorted, so that bytes know no order."""
+    plain = {key: value for key, value in attributes.items() if key not in RESERVED}
+    try:
+        result: dict[str, Any] = json.loads(storage.to_json(plain, sort_keys=True))
+    except ValueError as error:
+        raise NumericalError(f"{path}: an attribute is NaN or infinite") from error
+    return result
 
 
 def pose_groups(poses: Poses) -> Ints:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import NumericalError
-from sononerf.evaluation.solid import Nearest, Solid, sample_surface
+from sononerf.evaluation.metrics import Nearest, Solid, sample_surface
 from sononerf.geometry.lattice import Volume, grid_over, isosurface
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head

@@ -1,26 +1,242 @@
 # SPDX-License-Identifier: MIT
-"""Metrics of a surface and of a prediction, and differences between two runs."""
+"""A reconstructed surface and the baselines beside the true surface, registered if need be."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
+from trimesh.registration import procrustes
 
 from sononerf.display import Shown
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, NumericalError
-from sononerf.evaluation.baseline import BASELINES
-from sononerf.evaluation.geometry import Kind, Truth, baseline_volume
+from sononerf.evaluation.baseline import BASELINES, best_level_surface, volume_of
+from sononerf.evaluation.metrics import Solid, geometry_metrics, target_metrics
 from sononerf.evaluation.prediction import Prediction, prediction_numbers
 from sononerf.geometry.lattice import Volume
+from sononerf.geometry.poses import Poses
 from sononerf.numerics import Floats
 from sononerf.progress import Progress
+from sononerf.resources import computed
 from sononerf.scene.scene import Scene
-from sononerf.surface.surface import Surface
+from sononerf.start.surface import Surface
+
+MANY = 64
+"""Number of training poses from which a process of its own saves time."""
+
+Kind = Literal["none", "rigid", "similarity"]
+
+COARSE = 500
+"""Samples of each surface while all starts are compared."""
+FINE = 10_000
+"""Samples of each surface for the best starts."""
+BEST = 3
+"""Number of starts that are refined with all samples."""
+STEPS = 100
+"""Most iterations from one start; most end after 20 to 50."""
+SETTLED = 1e-5
+"""Relative change of the mean distance at which the iteration ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A rigid motion or similarity."""
+
+    matrix: Floats  # (4, 4): From the reconstruction's frame to the true one, lengths in m
+    scale: float  # Scale of lengths; 1 for a rigid motion
+
+    def inverse(self) -> Registration:
+        """Return the motion from the true frame to that of the reconstruction."""
+        return Registration(
+            np.asarray(np.linalg.inv(self.matrix), dtype=np.float64), 1.0 / self.scale
+        )
+
+    def of(self, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+        """Return a moved copy of a mesh."""
+        moved = mesh.copy()
+        moved.apply_transform(self.matrix)
+        return moved
+
+
+def register(
+    reconstructed: trimesh.Trimesh, truth: trimesh.Trimesh, kind: Kind, *, seed: int = 0
+) -> Registration:
+    """Find the motion that lays one surface over another, by iterated closest points [1]_.
+
+    Each point of either surface is drawn to the nearest one of the other, so that a part of one
+    surface is not laid over a whole. The iteration starts as the surfaces lie and from all proper
+    alignments of their principal axes; the best result counts. A mirror image is never taken.
+
+    References:
+        .. [1] P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE PAMI
+           14(2), 1992.
+    """
+    if kind == "none":
+        return Registration(np.eye(4), 1.0)
+    scaled = kind == "similarity"
+    points, target = (
+        np.asarray(trimesh.sample.sample_surface(mesh, FINE, seed=seed)[0])
+        for mesh in (reconstructed, truth)
+    )
+    tried = [
+        _closest(points[:COARSE], target[:COARSE], start, scaled)
+        for start in _starts(points, target, scaled)
+    ]
+    tried.sort(key=lambda pair: pair[0])
+    best = min(
+        (_closest(points, target, start, scaled) for _, start in tried[:BEST]),
+        key=lambda pair: pair[0],
+    )
+    return Registration(best[1], float(np.cbrt(np.linalg.det(best[1][:3, :3]))))
+
+
+def _starts(points: Floats, target: Floats, scaled: bool) -> list[Floats]:
+    """Return the initial guesses (4, 4): identity, equal centres, and aligned axes."""
+    middles = points.mean(axis=0), target.mean(axis=0)
+    spread = [
+        np.sqrt(((p - m) ** 2).sum(axis=1).mean())
+        for p, m in zip((points, target), middles, strict=True)
+    ]
+    scale = spread[1] / spread[0] if scaled else 1.0
+    axes = [np.linalg.svd(p - m, full_matrices=False)[2] for p, m in
+            zip((points, target), middles, strict=True)]  # fmt: skip
+    turns = [np.eye(3)]
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = axes[1].T @ (np.array(signs)[:, None] * axes[0][list(order)])
+            if np.linalg.det(turn) > 0:
+                turns.append(turn)
+    starts = [] if scaled else [np.eye(4)]
+    for turn in turns:
+        start = np.eye(4)
+        start[:3, :3] = scale * turn
+        start[:3, 3] = middles[1] - scale * turn @ middles[0]
+        starts.append(start)
+    return starts
+
+
+def _closest(points: Floats, target: Floats, start: Floats, scaled: bool) -> tuple[float, Floats]:
+    """Iterate from a start; return the mean distance, m, and the motion."""
+    tree, motion, before = cKDTree(target), start, np.inf
+    for _ in range(STEPS):
+        moved = trimesh.transform_points(points, motion)
+        out, near = tree.query(moved)
+        back, origin = cKDTree(moved).query(target)
+        error = 0.5 * float(out.mean() + back.mean())
+        if error > (1.0 - SETTLED) * before:
+            break
+        before = error
+        pairs = np.concatenate([points, points[origin]]), np.concatenate([target[near], target])
+        motion = procrustes(*pairs, reflection=False, scale=scaled, return_cost=False)
+    return before, np.asarray(motion)
+
+
+MOST_TIMES = 30.0
+"""Largest ratio of the sizes of truth and reconstruction, no unit: mistaking inches for metres
+gives 39."""
+
+
+def check_truth(
+    reconstructed: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str
+) -> None:
+    """Refuse a true surface that is of another size, or elsewhere, before any work."""
+    sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (reconstructed, true)]
+    times = max(sizes) / max(min(sizes), 1e-12)
+    if kind != "similarity" and times > MOST_TIMES:
+        raise InputError(
+            f"{name}: {sizes[1]:.3g} m across, and the reconstruction {sizes[0]:.3g} m; give the "
+            "unit of its numbers (--unit mm, or evaluation.unit), or --registration similarity"
+        )
+    apart = np.maximum(
+        true.bounds[0] - reconstructed.bounds[1], reconstructed.bounds[0] - true.bounds[1]
+    )
+    if kind == "none" and (apart > 0).any():
+        raise InputError(
+            f"{name}: lies {np.linalg.norm(apart.clip(0)):.3g} m away from the reconstruction; "
+            "move it there, or give --registration rigid"
+        )
+
+
+def signed_error(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> Floats:
+    """Return how far each vertex lies off the true surface (V,), m: above zero outside of it.
+
+    Of a true surface that is open there is no inside; then all are above zero.
+    """
+    solid = Solid(true)
+    points = np.asarray(mesh.vertices, dtype=np.float64)
+    distance = solid.nearest.distance(points)
+    return np.where(solid.contains(points), -distance, distance) if solid.closed else distance
+
+
+BASELINE_VOXELS = 64
+"""Number of voxels of a baseline along the region's longest side: finer than the analysis window in
+all shipped scenes."""
+
+BASELINE_SAMPLES = 20_000
+"""Number of samples of a baseline's surface: the F-score then errs by 0.004, and it is stated to
+0.01."""
+
+
+class Truth:
+    """A true surface, laid over a reconstruction."""
+
+    def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:
+        self.surface = Solid(true)
+        self.kind: Kind = kind
+        self.motion: Registration = register(mesh, true, kind)
+        self.mesh = self.motion.of(mesh)
+        # The truth in the frame of the reconstruction, in which levels of baselines are chosen.
+        self._near = self.surface if kind == "none" else Solid(self.motion.inverse().of(true))
+
+    def of_reconstruction(self, scene: Scene | None = None) -> dict[str, Any]:
+        """Return the metrics of the reconstruction; of a scene with a target, also of that alone.
+
+        The README's table names them.
+        """
+        metrics = geometry_metrics(self.mesh, self.surface)
+        if self.kind != "none":
+            metrics["registration"] = {
+                "kind": self.kind,
+                "scale": self.motion.scale,
+                "matrix": self.motion.matrix.tolist(),
+            }
+        surroundings = None if scene is None else scene.surface(background=True)
+        target = None if scene is None else scene.surface(background=False)
+        if surroundings is not None and target is not None:
+            metrics["target"] = target_metrics(self.mesh, target, surroundings)
+        return metrics
+
+    def of_volume(self, volume: Volume) -> dict[str, Any] | None:
+        """Return the metrics of a baseline at its best level; None where it has no surface."""
+        try:
+            mesh, level = best_level_surface(volume, self._near)
+        except NumericalError:
+            return None
+        moved = self.motion.of(mesh)
+        found = geometry_metrics(moved, self.surface, samples=BASELINE_SAMPLES)
+        return {**found, "level": level}
+
+
+def baseline_volume(name: str, echoes: Echoes, lower: Floats, upper: Floats) -> Volume:
+    """Compute a baseline: backprojection or a voxel fit of the training poses.
+
+    In: lower, upper ((3,), m).
+    """
+    train = echoes.store.indices("train")
+    spacing = float((upper - lower).max()) / BASELINE_VOXELS
+    poses = Poses(echoes.positions[train], echoes.rotations[train])
+    task = name, train, poses, echoes.head, lower, upper, spacing
+    if len(train) < MANY:
+        return volume_of(echoes.store, *task)
+    ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, what="baseline")
+    assert isinstance(volume, Volume)
+    return volume
+
 
 SAME = 1e-6
 """Largest distance between the centroids of two triangles that count as the same, m."""

@@ -32,7 +32,7 @@ from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
-from sononerf.surface.surface import Surface
+from sononerf.start.surface import Surface
 
 logger = logging.getLogger("sononerf")
 

@@ -21,9 +21,8 @@ from torch import Tensor
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError, ResourceError, SettingsError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
-from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.datamodule import EchoDataModule, RangeSlices, WholePoses, one_by_one
 from sononerf.field.module import EchoModule
-from sononerf.field.range_slices import RangeSlices, WholePoses, one_by_one
 from sononerf.geometry.poses import Poses
 from sononerf.numerics import Singles
 from sononerf.progress import Progress

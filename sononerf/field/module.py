@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""The LightningModule: field, renderer, loss and metrics. It writes no file."""
+"""Fields and renderers by name: plugins, factories and objects."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lightning
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -17,22 +18,76 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import IncompatibleError, NumericalError, SettingsError, expect
+from sononerf.errors import IncompatibleError, InputError, NumericalError, SettingsError, expect
 from sononerf.field.checkpoint_io import DurableCheckpointIO
-from sononerf.field.factories import FieldFactory, RendererFactory, box_of, make
+from sononerf.field.datamodule import RangeSlices, seed_of
 from sononerf.field.field import Field
-from sononerf.field.range_slices import RangeSlices, seed_of
-from sononerf.field.renderer import Possible, Renderer
+from sononerf.field.renderer import Possible, Renderer, tensor
 from sononerf.head.decibels import ACTIVE_DB, RANGE_DB
 from sononerf.head.head import Head
 from sononerf.numerics import Floats
-from sononerf.settings.loading import checked_section
+from sononerf.settings.loading import FIELDS, RENDERERS, call, check_options, checked_section, load
 from sononerf.settings.schema import (
     FieldSettings,
     FitSettings,
     RendererSettings,
     SpectrogramSettings,
 )
+
+Made = TypeVar("Made")
+FieldFactory = Callable[..., Field]
+"""Called with the region (2, 3), m, the frequencies (F,), Hz, and keyword options."""
+RendererFactory = Callable[..., Renderer]
+"""Called with the region (2, 3), m, the head, and keyword options."""
+
+
+def box_of(region: ArrayLike | Tensor) -> Tensor:
+    """Return a region (2, 3), m, in single precision."""
+    given = region if isinstance(region, Tensor) else torch.as_tensor(np.array(region, np.float64))
+    box = given.detach().to(torch.float32)
+    if box.shape != (2, 3) or not bool((box[0] < box[1]).all()):
+        raise SettingsError(
+            f"region: found {box.tolist()}; give lower and upper corner, (2, 3) in metres, the "
+            "lower below the upper on every axis"
+        )
+    return box
+
+
+def make(
+    given: Made | Callable[..., Made] | str,
+    kind: type[Made],
+    region: Tensor,
+    head: Head | None,
+    options: Mapping[str, Any],
+) -> Made:
+    """Return the object itself, or the one that a plugin's factory, or a factory, makes.
+
+    In: region ((2, 3), m).
+    """
+    if isinstance(given, kind):
+        return given
+    what = kind.__name__.lower()
+    group = FIELDS if issubclass(kind, Field) else RENDERERS
+    factory = load(group, given) if isinstance(given, str) else given
+    if not callable(factory):
+        raise InputError(
+            f"{what} is a {type(factory).__name__}, expected the name of a plugin, a factory or a "
+            f"sononerf {kind.__name__}"
+        )
+    if head is None:
+        raise SettingsError("head: missing; give the head that heard the echoes")
+    chosen = check_options(factory, options, where=f"{what}.options", given=2)
+    heard = tensor(head.frequency) if group == FIELDS else head
+    if isinstance(given, str):
+        result = call(f"{what} {given!r}", factory, region, heard, **chosen)
+    else:
+        result = factory(region, heard, **chosen)
+    if not isinstance(result, kind):
+        raise InputError(
+            f"{given!r} makes a {type(result).__name__}, expected a sononerf {kind.__name__}"
+        )
+    return result
+
 
 ENDLESS = 10**9
 """Number of steps that is assumed if a Trainer sets no end: the learning rate then stays the

@@ -14,8 +14,8 @@ from skimage.filters import threshold_otsu
 from skimage.measure import marching_cubes
 
 from sononerf.errors import NumericalError
-from sononerf.memory import require_memory
 from sononerf.numerics import Floats, Singles
+from sononerf.resources import require_memory
 
 MARGIN = 3
 """Number of empty voxels around the box: they close a surface at its border."""

@@ -19,9 +19,9 @@ from scipy.sparse import csr_array
 from scipy.special import j1
 
 from sononerf.errors import SettingsError
-from sononerf.head.directivity.directivity_files import content_hash, read_directivity
-from sononerf.head.directivity.record import Directivity, unit_vectors
-from sononerf.head.spectrogram import frequency_axis, smearing
+from sononerf.head.directivity import Directivity, unit_vectors
+from sononerf.head.directivity_files import content_hash, read_directivity
+from sononerf.head.front_end import frequency_axis, smearing
 from sononerf.numerics import Floats, Singles, compiled
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 

@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.display import Shown
 from sononerf.errors import InputError, SettingsError
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.head.air import absorption_in, speed_in
-from sononerf.head.call import call_waveform, covered, emit, sweep_delay
-from sononerf.head.call_file import load_call
+from sononerf.head.call import call_waveform, covered, emit, load_call, sweep_delay
 from sononerf.head.ears import Ears, analysed_ears, ear_tables, receiver_places
+from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, spectrogram
 from sononerf.head.reception import (
     draw_noise,
     effective_window,
@@ -33,10 +33,8 @@ from sononerf.head.reception import (
     within_band,
 )
 from sononerf.head.row_filters import RowFilters, band_mean, band_parts, row_filters
-from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
 from sononerf.numerics import Floats, Singles
 from sononerf.settings.loading import checked_section
-from sononerf.settings.scene_schema import SupportSettings
 from sononerf.settings.schema import (
     AirSettings,
     CallSettings,
@@ -45,6 +43,7 @@ from sononerf.settings.schema import (
     SpectrogramSettings,
     check_call,
 )
+from sononerf.settings.sections import SupportSettings
 
 
 @dataclass(frozen=True, eq=False)

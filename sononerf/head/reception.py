@@ -26,8 +26,8 @@ import scipy.fft
 from numpy.typing import ArrayLike
 
 from sononerf.head.call import call_waveform, covered, has_ghosts, sweep_delay, sweep_rate
+from sononerf.head.front_end import echo_samples, frequency_axis, spectrogram
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION, row_filters, row_widths
-from sononerf.head.spectrogram import echo_samples, frequency_axis, spectrogram
 from sononerf.numerics import Floats
 from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
 

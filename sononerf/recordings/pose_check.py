@@ -30,9 +30,9 @@ import numpy as np
 
 from sononerf.geometry.poses import Poses, off_axis
 from sononerf.numerics import Floats, Ints
-from sononerf.recordings.distance_model import Prediction, predict
 from sononerf.recordings.pose_tables import EULER, PLACE, QUATERNION, Columns, to_poses
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.recordings.ranges import Prediction, predict
+from sononerf.settings.sections import ImportSettings
 
 FEWEST = 12
 """Number of pings below which nothing can be tested."""

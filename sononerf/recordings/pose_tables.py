@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.display import number_in, read_rows
-from sononerf.echoes.layout import SPLITS
+from sononerf.echoes.memory_ensemble import SPLITS
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses, look_at, rotation_from_euler
 from sononerf.numerics import Floats
-from sononerf.settings.import_schema import LENGTHS, ImportSettings, TurntableSettings
+from sononerf.settings.sections import LENGTHS, ImportSettings, TurntableSettings
 
 ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6}

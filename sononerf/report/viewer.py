@@ -18,17 +18,16 @@ import trimesh
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.evaluation.prediction import Prediction
+from sononerf.field.datamodule import RangeSlices
 from sononerf.field.module import EchoModule, decibels
-from sononerf.field.range_slices import RangeSlices
 from sononerf.geometry.lattice import Volume, isosurface, level_surface
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.numerics import Floats
-from sononerf.report.notebook import STRETCH, echo_wav
-from sononerf.report.pictures.mesh_picture import CLAY, STEEL
-from sononerf.report.pictures.shading import DEFAULT_VIEW
-from sononerf.report.pictures.spectrogram_picture import quick_image, spectrogram_image
-from sononerf.report.surface_views import SurfaceViews
+from sononerf.report.figure import DEFAULT_VIEW
+from sononerf.report.mesh_picture import CLAY, STEEL, SurfaceViews
+from sononerf.report.page import STRETCH, echo_wav
+from sononerf.report.spectrogram_picture import quick_image, spectrogram_image
 
 HOST = "127.0.0.1"
 """Address of the page: only browsers on this machine reach it."""

@@ -19,17 +19,14 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
-from sononerf.geometry.frame import KEYS
-from sononerf.geometry.poses import Poses
-from sononerf.head.call_file import attach
+from sononerf.geometry.poses import KEYS, Poses
+from sononerf.head.call import attach
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.numerics import Floats
 from sononerf.progress import Progress
-from sononerf.run.run import Run
-from sononerf.settings.schema import SpectrogramSettings
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.self_calibration import (
+from sononerf.refinement.optics import Optics
+from sononerf.refinement.self_calibration import (
     KINDS,
     Calibration,
     Calibrator,
@@ -39,6 +36,8 @@ from sononerf.surface.refine.self_calibration import (
     find_support,
     with_support,
 )
+from sononerf.run.run import Run
+from sononerf.settings.schema import SpectrogramSettings
 
 DECIBELS = 20.0 / math.log(10.0)
 """Decibels of a natural logarithm of magnitude."""

@@ -14,10 +14,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sononerf import storage
+from sononerf import __version__, storage
 from sononerf.errors import SonoNerfError
-from sononerf.memory import available_cores, available_memory
-from sononerf.version import __version__
+from sononerf.resources import available_cores, available_memory
 
 PACKAGES = (
     "lightning",

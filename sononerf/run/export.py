@@ -16,16 +16,15 @@ import pyvista
 import scipy.io
 from numpy.typing import NDArray
 
-from sononerf import storage
+from sononerf import __version__, storage
 from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
-from sononerf.geometry.frame import Frame, FrameName
 from sononerf.geometry.lattice import Volume
+from sononerf.geometry.poses import Frame, FrameName
 from sononerf.run.build import locked
 from sononerf.run.run import Run
-from sononerf.surface.mesh_files import MeshFormat, confidence_of, error_of, mesh_bytes
-from sononerf.version import __version__
+from sononerf.start.surface import MeshFormat, confidence_of, error_of, mesh_bytes
 
 FileType = Literal["mat", "h5"]
 

@@ -15,23 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from sononerf import storage
+from sononerf import __version__, storage
 from sononerf.echoes.detection import seal_recorded
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
-from sononerf.head.call_file import attach
+from sononerf.head.call import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.numerics import Singles
 from sononerf.progress import Progress, duration
-from sononerf.recordings.pings import Channel, faults_of_channels
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
 from sononerf.recordings.pose_tables import original_frame
-from sononerf.report.pictures.spectrogram_picture import pings_png
+from sononerf.recordings.recording import Channel, faults_of_channels
+from sononerf.report.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.loading import assignments
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
-from sononerf.version import __version__
 
 logger = logging.getLogger("sononerf")
 

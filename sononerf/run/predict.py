@@ -25,18 +25,17 @@ from sononerf.evaluation.prediction import (
 )
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
-from sononerf.geometry.frame import FrameName
-from sononerf.geometry.poses import Poses, aim_fault
+from sononerf.geometry.poses import FrameName, Poses, aim_fault
 from sononerf.head.decibels import compress
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
 from sononerf.recordings.pose_tables import read_table, to_poses
-from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
+from sononerf.refinement.surface_error import Within, next_poses
+from sononerf.report.spectrogram_picture import spectrogram_picture
+from sononerf.run.build import NAME as TRACED_NAME
 from sononerf.run.build import results_folder
-from sononerf.run.model_files import NAME as TRACED_NAME
 from sononerf.run.run import Run, open_run
-from sononerf.settings.import_schema import read_import_settings
-from sononerf.surface.next_poses import Within, next_poses
+from sononerf.settings.loading import read_import_settings
 
 
 def propose(

@@ -18,25 +18,22 @@ import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from sononerf import storage
+from sononerf import __version__, storage
 from sononerf.callbacks import add_mesh, writing
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
-from sononerf.geometry.frame import Frame
 from sononerf.geometry.lattice import vti_bytes
+from sononerf.geometry.poses import Frame
 from sononerf.progress import Progress
-from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
-from sononerf.report.pictures.mip_picture import mip_pictures
+from sononerf.refinement import descent, reconstruction
+from sononerf.refinement.reconstruction import refine, starts_of
+from sononerf.refinement.surface_error import error_from_twice
+from sononerf.report.mesh_picture import confidence_png, mesh_png, side_by_side_png
+from sononerf.report.mip_picture import mip_pictures
 from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.run import Run
-from sononerf.surface import reconstruction
-from sononerf.surface.mesh_files import mesh_bytes
-from sononerf.surface.reconstruction import refine, starts_of
-from sononerf.surface.refine import descent
-from sononerf.surface.refine.surface_error import error_from_twice
-from sononerf.surface.start.read_out import Method
-from sononerf.surface.surface import FORMATS, Surface
-from sononerf.version import __version__
+from sononerf.start.read_out import Method
+from sononerf.start.surface import FORMATS, Surface, mesh_bytes
 
 logger = logging.getLogger("sononerf")
 

@@ -21,20 +21,19 @@ from sononerf.evaluation.prediction import evenly, ranked
 from sononerf.head.decibels import compress, mae_db
 from sononerf.numerics import Floats, Ints
 from sononerf.progress import Progress
+from sononerf.report.figure import curves_picture
+from sononerf.report.mesh_picture import SurfaceViews, mesh_png
+from sononerf.report.mip_picture import mip_pictures
 from sononerf.report.page import NONE, Page, run_rows
-from sononerf.report.pictures.figure import curves_picture
-from sononerf.report.pictures.mesh_picture import mesh_png
-from sononerf.report.pictures.mip_picture import mip_pictures
-from sononerf.report.pictures.scene_picture import scene_png
-from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
-from sononerf.report.surface_views import SurfaceViews
+from sononerf.report.scene_picture import scene_png
+from sononerf.report.spectrogram_picture import spectrogram_picture
 from sononerf.run.build import flat, true_mesh
 from sononerf.run.export import read_volume
 from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml
 from sononerf.settings.schema import Settings
-from sononerf.surface.mesh_files import confidence_of, error_of
-from sononerf.surface.start.read_out import read_isosurface
+from sononerf.start.read_out import read_isosurface
+from sononerf.start.surface import confidence_of, error_of
 
 PAGE = "report.html"
 

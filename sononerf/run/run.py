@@ -39,19 +39,17 @@ from sononerf.evaluation.prediction import TRACED, Prediction, predict
 from sononerf.evaluation.traced import Traced, for_single_poses
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME
 from sononerf.field.module import EchoModule
-from sononerf.geometry.frame import Frame, FrameName
-from sononerf.geometry.poses import Poses
-from sononerf.head.call_file import attach
+from sononerf.geometry.poses import Frame, FrameName, Poses
+from sononerf.head.call import attach
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.run import model_files
+from sononerf.run import build
 from sononerf.run.build import differing_keys, versions
 from sononerf.run.simulate import find_ensemble
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import ensemble_poses
-from sononerf.surface.mesh_files import confidence_of, error_of
-from sononerf.surface.surface import Surface
+from sononerf.start.surface import Surface, confidence_of, error_of
 
 METRICS_SCHEMA = 1
 Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
@@ -104,8 +102,8 @@ class Run(Shown):
     # What its stages left.
 
     @cached_property
-    def _model(self) -> model_files.Model:
-        return model_files.read_model(self.path)
+    def _model(self) -> build.Model:
+        return build.read_model(self.path)
 
     @property
     def model(self) -> EchoModule:
@@ -172,12 +170,12 @@ class Run(Shown):
         return found if isinstance(found, dict) else {}
 
     def frame(self, name: FrameName = "auto") -> Frame:
-        """Return the frame of that name; see :meth:`sononerf.geometry.frame.Frame.of`."""
+        """Return the frame of that name; see :meth:`sononerf.geometry.poses.Frame.of`."""
         return Frame.of(self.provenance, name)
 
     def mesh(self) -> trimesh.Trimesh:
         """Read the reconstructed surface."""
-        return model_files.read_mesh(
+        return build.read_mesh(
             self.reconstruction / "mesh.ply", f"sononerf reconstruct {self.path}"
         )
 
@@ -234,14 +232,14 @@ class Run(Shown):
 
     def traced(self) -> Traced | None:
         """Return the surface that echoes are traced off, and their weight; None without them."""
-        found, kept = model_files.load_traced(self.path), self._kept
-        if found is None or kept is None or not model_files.same_mesh(found.mesh, kept.mesh):
+        found, kept = build.load_traced(self.path), self._kept
+        if found is None or kept is None or not build.same_mesh(found.mesh, kept.mesh):
             return found
         return replace(found, simulator=kept.simulator)
 
     def keep_traced(self, traced: Traced) -> None:
         """Write the traced surface, with its gain and weight."""
-        model_files.save_traced(self.path, traced)
+        build.save_traced(self.path, traced)
         self._kept = traced
 
     def _traces_its_mesh(self) -> bool:
@@ -250,7 +248,7 @@ class Run(Shown):
             traced, mesh = self.traced(), self.mesh()
         except InputError:
             return False
-        return traced is not None and model_files.same_mesh(traced.mesh, mesh)
+        return traced is not None and build.same_mesh(traced.mesh, mesh)
 
     def predict(
         self,

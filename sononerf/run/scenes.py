@@ -18,12 +18,12 @@ from sononerf.display import aligned
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.head.decibels import compress
-from sononerf.report.pictures.mesh_picture import mesh_png
-from sononerf.report.pictures.scene_picture import echo_png, scene_png
+from sononerf.report.mesh_picture import mesh_png
+from sononerf.report.scene_picture import echo_png, scene_png
 from sononerf.run.build import simulator_of
 from sononerf.run.simulate import scene_of
 from sononerf.scene.scene import list_scenes, load_scene
-from sononerf.settings import plugins
+from sononerf.settings import loading
 from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import pose_seed
 
@@ -40,7 +40,7 @@ def new_plugin(kind: Kind, name: str, folder: Path | None = None) -> list[Path]:
             f"NAME: found {name!r}; give letters, digits, _ and -, a letter first and no _ or - "
             "last, e.g. my_bar"
         )
-    if any(plugin.name == module for plugin in plugins.registered(f"sononerf.{kind}s")):
+    if any(plugin.name == module for plugin in loading.registered(f"sononerf.{kind}s")):
         raise SettingsError(f"NAME: there is a {kind} {module!r}; choose another, e.g. my_{module}")
     folder = Path(name) if folder is None else folder
     if folder.is_dir() and any(folder.iterdir()):
@@ -70,7 +70,7 @@ def describe_scenes() -> list[dict[str, Any]]:
         }
         try:
             with _quietly():
-                factory = plugins.load(plugins.SCENES, plugin.name)
+                factory = loading.load(loading.SCENES, plugin.name)
                 row["summary"] = (inspect.getdoc(factory) or "").partition("\n")[0]
                 row["options"], row["needs"] = _options(factory)
                 if not row["needs"]:
@@ -99,11 +99,11 @@ def scene_table(rows: list[dict[str, Any]]) -> list[str]:
 def describe_scene(name: str) -> dict[str, Any]:
     """Return the description of one scene, with its options."""
     with _quietly():
-        factory = plugins.load(plugins.SCENES, name)
+        factory = loading.load(loading.SCENES, name)
         return {
             "name": name,
             "description": (inspect.getdoc(factory) or "").partition("\n\nReturns:\n")[0],
-            "options": plugins.describe_options(factory),
+            "options": loading.describe_options(factory),
         }
 
 
@@ -154,7 +154,7 @@ def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
     for plugin in list_scenes():
         try:
             with _quietly():
-                needs = _options(plugins.load(plugins.SCENES, plugin.name))[1]
+                needs = _options(loading.load(loading.SCENES, plugin.name))[1]
                 picture = None if needs else mesh_png(load_scene(plugin.name).mesh)
         except SonoNerfError as error:
             skipped.append(f"{plugin.name}: " + " ".join(str(error).split()))

@@ -10,15 +10,14 @@ from sononerf.echoes.echoes import Echoes, complete_store
 from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.progress import Progress
-from sononerf.recordings.audio import pose_table, wav_bytes
+from sononerf.recordings.recording import pose_table, wav_bytes
 from sononerf.run.build import head_of, simulator_of
 from sononerf.run.understand import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import to_yaml
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation import ensemble
-from sononerf.simulation.accuracy import settle_rays
-from sononerf.simulation.simulator import ensemble_poses, pose_seed
+from sononerf.simulation.simulator import ensemble_poses, pose_seed, settle_rays
 
 
 def echo_hash(settings: Settings, scene: Scene) -> str:

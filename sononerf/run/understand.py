@@ -15,34 +15,39 @@ from sononerf.echoes.memory_ensemble import draw_split, split_of
 from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.head.call import call_content, call_waveform
+from sononerf.head.front_end import echo_samples
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_band
-from sononerf.head.spectrogram import echo_samples
 from sononerf.numerics import Ints
 from sononerf.progress import Progress
-from sononerf.recordings.audio import Recording
-from sononerf.recordings.folder import read_folder
-from sononerf.recordings.import_ranges import calibrated, found_ranges
-from sononerf.recordings.pings import (
+from sononerf.recordings.pose_tables import to_poses
+from sononerf.recordings.ranges import calibrated, found_ranges
+from sononerf.recordings.readers import (
+    read_airsas,
+    read_folder,
+    read_numpy,
+    read_sononerf_matlab,
+    read_sonotracelab,
+)
+from sononerf.recordings.recording import (
     Channel,
     Cutter,
+    Recording,
     channels_of,
     check_channels,
     check_numbers,
     clipped_pings,
     mix,
 )
-from sononerf.recordings.pose_tables import to_poses
-from sononerf.recordings.readers import (
-    read_airsas,
-    read_numpy,
-    read_sononerf_matlab,
-    read_sonotracelab,
-)
 from sononerf.run.build import head_of
-from sononerf.settings.import_schema import ImportSettings, read_import_settings
-from sononerf.settings.loading import apply_override, read_yaml, validate_settings
+from sononerf.settings.loading import (
+    apply_override,
+    read_import_settings,
+    read_yaml,
+    validate_settings,
+)
 from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, CallSettings, Settings
+from sononerf.settings.sections import ImportSettings
 
 FOLDER = "recordings"
 READERS: dict[str, Callable[[Path, ImportSettings], Recording]] = {

@@ -11,13 +11,13 @@ import trimesh
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, SonoNerfError
 from sononerf.progress import Progress
-from sononerf.report.surface_views import SurfaceViews
+from sononerf.report.mesh_picture import SurfaceViews
 from sononerf.report.viewer import Viewer
 from sononerf.run.build import true_mesh
 from sononerf.run.export import read_volume
 from sononerf.run.run import Run, open_run
 from sononerf.run.simulate import store_path
-from sononerf.surface.mesh_files import confidence_of, error_of
+from sononerf.start.surface import confidence_of, error_of
 
 WAIT = 2.0
 """Interval at which a run's folder is checked for new files, s."""

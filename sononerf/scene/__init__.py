@@ -2,16 +2,8 @@
 """Scenes: surfaces, materials and compositions; the public names for scene plugins."""
 
 from sononerf.scene.composition import Part, compose
-from sononerf.scene.material import Material
-from sononerf.scene.scene import (
-    MATERIALS,
-    MaterialName,
-    Scene,
-    SurfaceSizeError,
-    check_surface,
-    list_scenes,
-    load_scene,
-)
+from sononerf.scene.material import MATERIALS, Material, MaterialName
+from sononerf.scene.scene import Scene, SurfaceSizeError, check_surface, list_scenes, load_scene
 
 __all__ = [
     "MATERIALS",

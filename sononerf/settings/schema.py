@@ -15,18 +15,23 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from sononerf.settings.call_presets import CALL_PRESETS, fft_of, hop_of, window_of
-from sononerf.settings.scene_schema import PoseSettings, SceneSettings, SupportSettings
-from sononerf.settings.section import (
+from sononerf.settings.sections import (
+    CALL_PRESETS,
     Count,
     Decibels,
     Level,
     Name,
+    PoseSettings,
     Positive,
+    SceneSettings,
     Section,
     Seed,
     Spacing,
+    SupportSettings,
     Vector,
+    fft_of,
+    hop_of,
+    window_of,
 )
 
 HEAD_SECTIONS = ("air", "ears", "call", "spectrogram", "support")

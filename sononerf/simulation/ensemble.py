@@ -14,29 +14,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf import storage
+from sononerf import __version__, storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal, split_of
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, expect
-from sononerf.executor import reach
 from sononerf.geometry.poses import Poses
-from sononerf.head.call import call_content
-from sononerf.head.call_file import attach
+from sononerf.head.call import attach, call_content
 from sononerf.head.ears import directivity_content
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_call
-from sononerf.memory import require_disk
 from sononerf.numerics import Floats, Singles
 from sononerf.progress import Progress
-from sononerf.scene.scene import Scene
+from sononerf.resources import reach, require_disk
+from sononerf.scene.scene import Scene, check_aim, check_poses, check_reach, deaf
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.accuracy import MOST, settle_rays
-from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach, deaf
-from sononerf.simulation.simulator import VERSION, Simulator, pose_seed
-from sononerf.simulation.workers import SeedOf, simulated
-from sononerf.version import __version__
+from sononerf.simulation.simulator import (
+    MOST,
+    VERSION,
+    SeedOf,
+    Simulator,
+    pose_seed,
+    settle_rays,
+    simulated,
+)
 
 Write = Callable[[int, Singles], None]
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
 from sononerf.numerics import Bools, Complexes, Floats, Ints, Singles, compiled

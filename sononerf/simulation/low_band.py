@@ -23,11 +23,11 @@ from threadpoolctl import threadpool_limits
 
 from sononerf.errors import ResourceError
 from sononerf.geometry.directions import spread_points
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.head.ears import Ears, beam_gain, ear_gain
-from sononerf.memory import available_cores, available_memory
 from sononerf.numerics import Complexes, Floats, Ints
+from sononerf.resources import available_cores, available_memory
 from sononerf.scene.scene import Scene
 from sononerf.simulation.equivalent_sources import (
     CHECKS,

@@ -17,7 +17,7 @@ from sononerf.geometry.meshes import bodies, enclosing_balls
 from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.numerics import Bools, Floats, Ints, Singles
 from sononerf.scene.scene import Scene
-from sononerf.simulation.diffraction import Diffraction
+from sononerf.simulation.diffraction import Diffraction, Outlines
 from sononerf.simulation.hearing import (
     EARS_APART,
     RESOLVED_FREQUENCY,
@@ -25,9 +25,16 @@ from sononerf.simulation.hearing import (
     Hearing,
     Listener,
 )
-from sononerf.simulation.outlines import Outlines
-from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
-from sononerf.simulation.reflection import Reflection, coarse_gain, reflection, unfaded
+from sononerf.simulation.paths import (
+    Bounce,
+    Reflection,
+    aim,
+    coarse_gain,
+    echo_paths,
+    gathered,
+    reflection,
+    unfaded,
+)
 from sononerf.simulation.shadows import LEAST, Shadow, behind, passing
 
 HIDDEN_SHARE = 0.15  # as many rays again, for surfaces behind obstacles

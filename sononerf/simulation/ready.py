@@ -22,10 +22,7 @@ from sononerf.settings.schema import (
     SimulationSettings,
     SpectrogramSettings,
 )
-from sononerf.simulation import workers
 from sononerf.simulation.simulator import Simulator
-
-__all__ = ["workers"]
 
 
 def trace_once() -> None:

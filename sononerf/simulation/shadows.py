@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.numerics import Bools, Complexes, Floats, Ints, compiled
+from sononerf.simulation.diffraction import Outlines
 from sononerf.simulation.hearing import RESOLVED_FREQUENCY
 from sononerf.simulation.impulse_response import NODE_SPACING
-from sononerf.simulation.outlines import Outlines
 
 CELL = 0.25
 """Size of a piece of surface with one obstacle factor, over the root of wavelength times the radius

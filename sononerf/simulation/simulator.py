@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.echoes.memory_ensemble import TEST, TRAIN, VALIDATION
-from sononerf.errors import InputError
+from sononerf.errors import InputError, SonoNerfError
 from sononerf.geometry.poses import (
     Poses,
     cap_poses,
@@ -24,13 +26,14 @@ from sononerf.geometry.poses import (
     random_poses,
     random_sphere_poses,
 )
+from sononerf.head.decibels import RANGE_DB, compress, mae_db
 from sononerf.head.head import Head
-from sononerf.memory import require_memory
 from sononerf.numerics import Floats, Singles
-from sononerf.progress import Progress
+from sononerf.progress import Progress, Task
+from sononerf.resources import TaskError, available_cores, computed, preload, require_memory
 from sononerf.scene.scene import Scene
-from sononerf.settings.scene_schema import PoseSettings
 from sononerf.settings.schema import SimulationSettings
+from sononerf.settings.sections import PoseSettings
 from sononerf.simulation.hearing import RESOLVED_FREQUENCY, Arrival, hearing_of, silence_before
 from sononerf.simulation.low_band import LowBand, low_band
 from sononerf.simulation.rays import Rays
@@ -225,3 +228,139 @@ def _path_poses(settings: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.i
         order = _generator(settings, member).permutation(len(poses))
         split[order[split[order] == TRAIN][:count]] = member
     return poses, split
+
+
+MOST_WORKERS = 8
+WORTH_RAYS = 250_000
+"""Rays of all poses from which other processes save time: fewer are traced before these start."""
+
+READY = "sononerf.simulation.ready"
+"""What worker processes have imported when they start."""
+preload(READY)
+
+Results = Generator[tuple[int, Singles], None, None]
+SeedOf = Callable[[int], int]
+"""Gives the seed of a pose by its index."""
+
+
+def useful_workers(poses: int, rays: int) -> int:
+    """Return the number of processes that simulates the poses soonest; one means this process."""
+    return min(available_cores(), MOST_WORKERS) if poses * rays >= WORTH_RAYS else 1
+
+
+def simulated(
+    simulator: Simulator,
+    poses: Poses,
+    indices: list[int],
+    seed_of: SeedOf,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Results:
+    """Yield indices and spectrograms of poses, in any order."""
+    if workers is None:
+        workers = useful_workers(len(indices), simulator.rays.rays)
+    if simulator.low is not None:
+        simulator.low.prepare(poses.positions[indices], poses.rotations[indices])
+    tasks = {i: (poses.positions[i], poses.rotations[i], seed_of(i)) for i in indices}
+    try:
+        if workers > 1 or scheduler is not None:
+            yield from computed(_one, simulator, tasks, workers, scheduler=scheduler)
+            return
+        for index, task in tasks.items():
+            try:
+                spectrogram = _one(simulator, *task)
+            except Exception as error:
+                raise TaskError(index, error) from error
+            yield index, spectrogram
+    except TaskError as error:
+        raise SonoNerfError(f"pose {error.number} cannot be simulated: {error}") from error
+
+
+def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) -> Singles:
+    return simulator.spectrogram(position, rotation, seed=seed)
+
+
+FIRST = 30_000
+"""Rays per pose of the first trial. Fewer rays hardly save time."""
+MOST = 300_000
+"""Largest number of rays per pose that the search for an accuracy takes. Sound that bounces between
+many bodies converges slowly: with this number ``ua`` has 0.8 dB, and 0.2 dB would take ten times as
+many."""
+POSES = 8
+"""Poses that are simulated twice in a trial, spread evenly over all of them."""
+CONVERGENCE = 0.6
+"""The difference is proportional to the number of rays to the power -CONVERGENCE, measured from
+30,000 to 300,000 rays on ``three_spheres``; on ``ua`` the power is 0.4."""
+LEAST_DB = 1e-6
+"""Difference below which two simulations are the same, dB."""
+STEP = 1.3, 10.0
+"""Least and greatest factor from one trial's number of rays to the next one's."""
+
+
+def settle_rays(
+    simulator: Simulator,
+    poses: Poses,
+    options: SimulationSettings,
+    progress: Progress,
+    *,
+    workers: int | None = None,
+) -> int:
+    """Set the number of rays per pose that reaches the accuracy of the settings.
+
+    The difference between two seeds is measured at a few poses, as the noise floor is: the mean
+    over active cells of reported decibels. Call :meth:`Simulator.prepare` first; its results are
+    used.
+    """
+    tracer = simulator.rays
+    if options.rays is not None:
+        tracer.rays = options.rays
+        return tracer.rays
+    chosen = np.unique(np.linspace(0, len(poses) - 1, POSES).round().astype(int))
+    some = Poses(poses.positions[chosen], poses.rotations[chosen])
+    tracer.rays = FIRST
+    trials: list[float] = []  # errors, scaled to one ray per pose
+    while tracer.rays < MOST:
+        with progress.task(f"trying {tracer.rays} rays per pose", 2 * len(chosen)) as task:
+            found = max(_difference(simulator, some, task, workers), LEAST_DB)
+        trials.append(found * tracer.rays**CONVERGENCE)
+        # A trial of so few poses is uncertain by a tenth or more, so all trials are averaged.
+        error = float(np.exp(np.mean(np.log(trials)))) / tracer.rays**CONVERGENCE
+        if error <= options.accuracy_db:
+            progress.say(f"echoes: {tracer.rays} rays per pose, {error:.2g} dB between two seeds")
+            return tracer.rays
+        factor = (error / options.accuracy_db) ** (1.0 / CONVERGENCE)
+        tracer.rays = min(MOST, _rounded(tracer.rays * float(np.clip(factor, *STEP))))
+    progress.say(
+        f"echoes: {MOST} rays per pose, the most that are chosen; fewer were less accurate than "
+        f"simulation.accuracy_db ({options.accuracy_db:g} dB); simulation.rays=NUMBER takes more"
+    )
+    return tracer.rays
+
+
+def _difference(simulator: Simulator, poses: Poses, task: Task, workers: int | None) -> float:
+    """Return the mean difference between two seeds over active cells, dB."""
+    quiet = copy.copy(simulator)
+    quiet.head = simulator.head.without_noise()
+    spectrograms: dict[int, Singles] = {}
+    twice = Poses(*(np.concatenate([part, part]) for part in (poses.positions, poses.rotations)))
+    indices = list(range(len(twice)))
+    with closing(simulated(quiet, twice, indices, lambda index: index, workers=workers)) as results:
+        for index, spectrogram in results:
+            spectrograms[index] = spectrogram
+            task.advance()
+    first, second = (
+        np.stack([spectrograms[index + after] for index in range(len(poses))])
+        for after in (0, len(poses))
+    )
+    loudest = float(max(first.max(), second.max()))
+    if loudest <= 0.0:
+        return 0.0
+    reference = loudest * 10.0 ** (-RANGE_DB / 20.0)
+    return mae_db(compress(first, reference), compress(second, reference), active=True) or 0.0
+
+
+def _rounded(rays: float) -> int:
+    """Round up to two digits, so that rounding errors do not show in the number."""
+    unit = 10 ** max(len(str(round(rays))) - 2, 0)
+    return int(-(-rays // unit) * unit)

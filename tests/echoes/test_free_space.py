@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sononerf.echoes.detection import FALSE_ALARMS, Onsets, find_onsets
+from sononerf.head.front_end import frequency_axis, range_axis
 from sononerf.head.head import PointEcho
 from sononerf.head.reception import effective_window
-from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 STEP = 0.0007

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.echoes.range_levels import FEWEST_POSES, MOST_PAIRS, RangeLevels, evenly_chosen
-from sononerf.geometry.plane import Plane
+from sononerf.echoes.detection import FEWEST_POSES, MOST_PAIRS, RangeLevels, evenly_chosen
+from sononerf.geometry.meshes import Plane
 
 RESOLUTION, SPACING, FIRST = 0.006, 0.0007, 0.2
 

@@ -4,13 +4,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.echoes.detection import PointEcho, find_onsets
+from sononerf.echoes.detection import find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.region import EchoRegion
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import ear_tables
+from sononerf.head.head import PointEcho
 from sononerf.settings.schema import EarSettings
 
 STEP = 0.001

@@ -11,8 +11,8 @@ import trimesh
 
 from sononerf.errors import NumericalError
 from sononerf.evaluation.baseline import voxel_fit
-from sononerf.evaluation.geometry import register
-from sononerf.evaluation.solid import Solid, sample_surface
+from sononerf.evaluation.metrics import Solid, sample_surface
+from sononerf.evaluation.numbers import register
 from sononerf.geometry.poses import Poses
 
 

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.metrics import mae_db, prediction_metrics
+from sononerf.evaluation.prediction import prediction_metrics
+from sononerf.head.decibels import mae_db
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from sononerf.field.field import Field
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.head.head import PointEcho
 
 

@@ -3,7 +3,7 @@
 
 import torch
 
-from sononerf.field.grid import GridField
+from sononerf.field.fields import GridField
 
 # 51, 40 and 27 mm: in steps of 10 mm 7 x 5 x 4 vertices, in steps of 20 mm 4 x 3 x 3.
 REGION = torch.tensor([[-0.03, 0.01, 0.2], [0.021, 0.05, 0.227]], dtype=torch.float64)

@@ -6,7 +6,7 @@ import torch
 
 from sononerf.errors import SettingsError
 from sononerf.field.field import sphere_directions
-from sononerf.field.fourier import FourierField
+from sononerf.field.fields import FourierField
 from sononerf.geometry.poses import rotation_from_euler
 
 REGION = torch.tensor([[-0.1] * 3, [0.1] * 3], dtype=torch.float64)

@@ -12,8 +12,8 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
+from sononerf.field.fields import GridField
 from sononerf.field.fitting import fit, quiet_lightning
-from sononerf.field.grid import GridField
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head

@@ -20,11 +20,10 @@ from sononerf.field.checkpoint_io import (
     model_checksum,
     save_weights,
 )
-from sononerf.field.datamodule import EchoDataModule
-from sononerf.field.grid import GridField
+from sononerf.field.datamodule import EchoDataModule, RangeSlices
+from sononerf.field.fields import GridField
 from sononerf.field.module import EchoModule, decibels
 from sononerf.field.profile import ProfileRenderer
-from sononerf.field.range_slices import RangeSlices
 from sononerf.field.renderer import Renderer, ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at

@@ -7,10 +7,9 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.field.fourier import FourierField
-from sononerf.field.grid import GridField
+from sononerf.field.fields import FourierField, GridField
 from sononerf.field.profile import ProfileRenderer
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.run.build import head_of, simulator_of
 from sononerf.scene.scene import Scene

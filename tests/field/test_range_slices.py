@@ -5,7 +5,7 @@ import torch
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import SettingsError
-from sononerf.field.range_slices import PoseReader, SliceStream, WholePoses, seed_of
+from sononerf.field.datamodule import PoseReader, SliceStream, WholePoses, seed_of
 
 POSES, RANGES, FREQUENCIES = 11, 6, 5
 TRAIN = [0, 2, 3, 5, 7, 8, 10]

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from sononerf.field.field import sphere_directions
-from sononerf.field.fourier import FourierField
-from sononerf.field.grid import GridField
+from sononerf.field.fields import FourierField, GridField
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import Renderer, ShellRenderer, look_up
 from sononerf.geometry.poses import look_at

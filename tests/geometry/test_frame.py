@@ -9,10 +9,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from sononerf.errors import InputError
-from sononerf.geometry.frame import Frame
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
+from sononerf.geometry.poses import Frame
 from sononerf.recordings.pose_tables import original_frame, read_table, to_poses
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.settings.sections import ImportSettings
 
 FRAMES = {
     "ned": {"frame": "ned"},

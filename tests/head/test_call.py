@@ -15,10 +15,10 @@ from sononerf.head.call import (
     covered,
     emit,
     has_ghosts,
+    load_call,
     sweep_delay,
     sweep_rate,
 )
-from sononerf.head.call_file import load_call
 from sononerf.head.head import Head
 from sononerf.head.reception import effective_window
 from sononerf.settings.schema import CallSettings, SpectrogramSettings

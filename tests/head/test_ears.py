@@ -8,7 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.call import call_waveform, sweep_delay
-from sononerf.head.directivity.directivity_files import write_sofa
+from sononerf.head.directivity_files import write_sofa
 from sononerf.head.ears import (
     SPEED,
     analysed_ears,
@@ -19,7 +19,7 @@ from sononerf.head.ears import (
     piston,
     receiver_places,
 )
-from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, spectrogram
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 from tests.head.directivity.patterns import (
     AZIMUTH,

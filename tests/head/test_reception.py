@@ -6,9 +6,9 @@ import pytest
 import scipy.signal
 
 from sononerf.head.call import sweep_delay
+from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, spectrogram
 from sononerf.head.head import Head
 from sononerf.head.reception import best_window, effective_window, row_duration, warn_of_call
-from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
 from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
 
 SPEED = 343.0

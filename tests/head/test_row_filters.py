@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from sononerf.head.call import call_waveform, sweep_delay
+from sononerf.head.front_end import echo_samples, range_axis, spectrogram
 from sononerf.head.reception import effective_window
 from sononerf.head.row_filters import band_mean, row_filters, row_frequencies, row_widths
-from sononerf.head.spectrogram import echo_samples, range_axis, spectrogram
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 SPEED = 343.0

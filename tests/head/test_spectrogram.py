@@ -7,13 +7,7 @@ import scipy.signal
 
 from sononerf.head.call import call_waveform, sweep_delay
 from sononerf.head.decibels import compress
-from sononerf.head.spectrogram import (
-    echo_samples,
-    frequency_axis,
-    range_axis,
-    smearing,
-    spectrogram,
-)
+from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, smearing, spectrogram
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 DEFAULT = SpectrogramSettings()

@@ -10,7 +10,7 @@ import pytest
 from sononerf.errors import InputError
 from sononerf.recordings.pose_tables import to_poses
 from sononerf.recordings.readers import read_airsas
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.settings.sections import ImportSettings
 
 COUNT, SAMPLES = 5, 80
 RATE = ImportSettings(sampling_rate=1e5)

@@ -11,11 +11,10 @@ from scipy.io import wavfile
 
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
-from sononerf.recordings.audio import as_float, pose_table, read_audio, wav_bytes
-from sononerf.recordings.folder import read_folder
 from sononerf.recordings.pose_tables import to_poses
-from sononerf.recordings.readers import read_numpy
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.recordings.readers import read_folder, read_numpy
+from sononerf.recordings.recording import as_float, pose_table, read_audio, wav_bytes
+from sononerf.settings.sections import ImportSettings
 
 RATE = 250_000
 

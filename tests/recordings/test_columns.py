@@ -16,7 +16,7 @@ from sononerf.recordings.pose_tables import (
     to_poses,
     turntable_poses,
 )
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.settings.sections import ImportSettings
 
 PLAIN = ImportSettings()
 

@@ -9,9 +9,9 @@ import pytest
 from scipy.io import wavfile
 
 from sononerf.errors import InputError
-from sononerf.recordings.folder import read_folder
-from sononerf.recordings.pings import Cutter
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.recordings.readers import read_folder
+from sononerf.recordings.recording import Cutter
+from sononerf.settings.sections import ImportSettings
 
 RATE = 100_000
 PLAIN = ImportSettings()

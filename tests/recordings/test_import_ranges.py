@@ -11,12 +11,12 @@ import pytest
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, emit
 from sononerf.head.ears import beam_gain, ear_gain, ear_tables
+from sononerf.head.front_end import frequency_axis
 from sononerf.head.head import Head
-from sononerf.head.spectrogram import frequency_axis
-from sononerf.recordings.import_ranges import calibrate
+from sononerf.recordings.ranges import calibrate
 from sononerf.run.understand import understand
-from sononerf.settings.import_schema import ReferenceSettings
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
+from sononerf.settings.sections import ReferenceSettings
 from tests.recordings.recorded import SETTINGS, arrays, waveforms
 
 

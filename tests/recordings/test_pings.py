@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.recordings.audio import Recording
-from sononerf.recordings.pings import Clipping, Cutter, check_numbers, clipped_pings, cut, mix
 from sononerf.recordings.pose_tables import Columns
+from sononerf.recordings.recording import (
+    Clipping,
+    Cutter,
+    Recording,
+    check_numbers,
+    clipped_pings,
+    cut,
+    mix,
+)
 
 RATE = 1e5
 

@@ -11,12 +11,11 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
-from sononerf.recordings.audio import Recording
-from sononerf.recordings.distance_model import predict
-from sononerf.recordings.pings import channels_of, check_channels, faults_of_channels
 from sononerf.recordings.pose_check import alternatives, check_poses, mirrored, shifted
 from sononerf.recordings.pose_tables import Columns, to_poses
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.recordings.ranges import predict
+from sononerf.recordings.recording import Recording, channels_of, check_channels, faults_of_channels
+from sononerf.settings.sections import ImportSettings
 from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
 
 RESOLUTION = 0.0058  # m, of the default analysis

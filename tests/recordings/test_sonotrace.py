@@ -11,7 +11,7 @@ from sononerf.errors import InputError
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.recordings.pose_tables import to_poses
 from sononerf.recordings.readers import read_sononerf_matlab, read_sonotracelab
-from sononerf.settings.import_schema import ImportSettings
+from sononerf.settings.sections import ImportSettings
 from tests.matlab_writer import write_new
 
 PLAIN = ImportSettings()

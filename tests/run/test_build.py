@@ -16,20 +16,19 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.field.fourier import FourierField
-from sononerf.field.grid import GridField
+from sononerf.field.fields import FourierField, GridField
 from sononerf.field.module import EchoModule
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.refinement.objective import SCALE
+from sononerf.refinement.optics import Optics
+from sononerf.refinement.refine import Refinement
 from sononerf.run.build import head_of, module_for, read_truth, true_mesh, with_store
 from sononerf.run.fit import finish, fit
 from sononerf.run.simulate import simulate
 from sononerf.settings.loading import load_settings, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS
-from sononerf.surface.refine.objective import SCALE
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement
 from tests.memory import echoes_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

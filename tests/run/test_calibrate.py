@@ -12,13 +12,13 @@ import trimesh
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.head.spectrogram import range_axis
+from sononerf.head.front_end import range_axis
+from sononerf.refinement.self_calibration import Calibration, Estimate
 from sononerf.run import calibrate as module
 from sononerf.run.build import with_store
 from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of, moved
 from sononerf.run.run import Run
 from sononerf.settings.schema import SpectrogramSettings
-from sononerf.surface.refine.self_calibration import Calibration, Estimate
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 

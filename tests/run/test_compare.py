@@ -14,11 +14,10 @@ from PIL import Image
 
 from sononerf.errors import IncompatibleError, InputError, NumericalError, SettingsError
 from sononerf.evaluation import baseline
-from sononerf.evaluation import geometry as geometry_module
+from sononerf.evaluation import numbers as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.progress import Progress
-from sononerf.run.compare import compare_runs
-from sononerf.run.evaluate import evaluate
+from sononerf.run.evaluate import compare_runs, evaluate
 from sononerf.run.reconstruct import reconstruct
 from sononerf.settings.loading import validate_settings
 

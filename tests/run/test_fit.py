@@ -19,7 +19,7 @@ import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from sononerf import memory, storage
+from sononerf import resources, storage
 from sononerf.callbacks import SIGNALS, ProgressCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
@@ -35,13 +35,12 @@ from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
-from sononerf.head.directivity.directivity_files import write_sofa
+from sononerf.head.directivity_files import write_sofa
 from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
-from sononerf.run.fit import fit, peak_memory_bytes
-from sononerf.run.fit_warnings import LINE, fit_warnings
+from sononerf.run.fit import LINE, fit, fit_warnings, peak_memory_bytes
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import STAGES, Run
@@ -303,7 +302,7 @@ def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, dir
 
 
 def test_a_fit_that_needs_too_much_memory_leaves_nothing(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "available_memory", lambda: 1_000_000)
+    monkeypatch.setattr(resources, "available_memory", lambda: 1_000_000)
     with pytest.raises(ResourceError, match="a step of 2 poses needs about"):
         fit(tiny(), tmp_path / "run", accelerator="cpu", workers=1)
     assert not (tmp_path / "run").exists()

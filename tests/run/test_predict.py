@@ -16,9 +16,9 @@ from PIL import Image
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError
-from sononerf.head.call_file import attach
+from sononerf.head.call import attach
 from sononerf.head.decibels import compress
-from sononerf.head.directivity.directivity_files import write_sofa
+from sononerf.head.directivity_files import write_sofa
 from sononerf.run import predict as predict_module
 from sononerf.run.build import with_attached
 from sononerf.run.fit import fit

@@ -12,16 +12,16 @@ import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf.progress import Progress
+from sononerf.refinement import descent as stages
+from sononerf.refinement import objective as core
+from sononerf.refinement import reconstruction
+from sononerf.refinement.descent import Stage
+from sononerf.refinement.refine import Refinement
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.reconstruct import reconstruct, refine_surface
 from sononerf.run.run import Run
+from sononerf.start.surface import Surface
 from sononerf.storage import commit_json, read_json
-from sononerf.surface import reconstruction
-from sononerf.surface.refine import descent as stages
-from sononerf.surface.refine import objective as core
-from sononerf.surface.refine.descent import Stage
-from sononerf.surface.refine.refinement import Refinement
-from sononerf.surface.surface import Surface
 
 QUIET = Progress(quiet=True)
 BUMPY = trimesh.creation.icosphere(subdivisions=3, radius=0.0205)

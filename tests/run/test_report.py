@@ -17,11 +17,11 @@ import trimesh
 from PIL import Image
 
 from sononerf.errors import InputError
-from sononerf.report.surface_views import SurfaceViews
+from sononerf.report.mesh_picture import SurfaceViews
 from sononerf.run import report as report_module
-from sononerf.run.compare import table
+from sononerf.run.evaluate import table
 from sononerf.run.report import report as write_report
-from sononerf.surface.mesh_files import mesh_bytes
+from sononerf.start.surface import mesh_bytes
 from tests.browser import CHROMIUM, browser
 
 METRICS = {

@@ -18,7 +18,7 @@ from sononerf.errors import (
     SettingsError,
 )
 from sononerf.head.decibels import compress
-from sononerf.head.directivity.directivity_files import write_sofa
+from sononerf.head.directivity_files import write_sofa
 from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
     background_path,

@@ -23,7 +23,7 @@ from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.run import fit as finish_module
 from sononerf.run import predict as predict_module
-from sononerf.run.model_files import NAME, load_traced
+from sononerf.run.build import NAME, load_traced
 from sononerf.run.predict import predict
 from sononerf.run.run import Run
 

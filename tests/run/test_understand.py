@@ -9,7 +9,7 @@ import pytest
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.head.call import call_waveform
-from sononerf.recordings.audio import wav_bytes
+from sononerf.recordings.recording import wav_bytes
 from sononerf.run.build import with_store
 from sononerf.run.import_recordings import echo_hash, import_understood, spectrogram_of
 from sononerf.run.understand import understand

@@ -19,10 +19,10 @@ import trimesh
 
 from sononerf.errors import InputError
 from sononerf.geometry.lattice import Volume, vti_bytes
-from sononerf.report.notebook import RATE, STRETCH, echo_wav
+from sononerf.report.page import RATE, STRETCH, echo_wav
 from sononerf.run.run import Run
 from sononerf.run.view import View
-from sononerf.surface.mesh_files import mesh_bytes
+from sononerf.start.surface import mesh_bytes
 from tests.browser import CHROMIUM, browser
 
 

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from sononerf.errors import InputError, SettingsError
-from sononerf.geometry.plane import Plane
+from sononerf.geometry.meshes import Plane
 from sononerf.scene.material import LEAF, MATERIALS, RIGID, Material
 from sononerf.scene.scene import Scene, SurfaceSizeError, list_scenes, load_scene
-from sononerf.settings import plugins
+from sononerf.settings import loading
 
 
 def box(size=0.1):
@@ -217,6 +217,6 @@ def unreadable(size: "NoSuchType" = 1):  # noqa: F821
     ],
 )
 def test_a_faulty_factory_is_named_with_its_distribution(monkeypatch, factory, match):
-    monkeypatch.setattr(plugins, "load", lambda group, name: factory)
+    monkeypatch.setattr(loading, "load", lambda group, name: factory)
     with pytest.raises(InputError, match=rf"^scene 'sphere' of sononerf \S+? ?{match}$"):
         load_scene("sphere")

@@ -10,12 +10,12 @@ import pytest
 from pydantic import Field
 
 from sononerf.errors import InputError, ResourceError, SettingsError
-from sononerf.settings import plugins
+from sononerf.settings import loading
 
 PLUGIN_FILES = ("pyproject.toml", "fixture_bar.py")
 
 
-def distribution(folder, name, entries, modules=None, group=plugins.SCENES):
+def distribution(folder, name, entries, modules=None, group=loading.SCENES):
     """Lay a distribution's metadata into a folder, as an installer would."""
     info = folder / f"{name.replace('-', '_')}-2.0.dist-info"
     info.mkdir(parents=True)
@@ -40,23 +40,23 @@ def install(tmp_path, monkeypatch):
             del sys.modules[module]
 
 
-def names(group=plugins.SCENES):
-    return [plugin.name for plugin in plugins.registered(group)]
+def names(group=loading.SCENES):
+    return [plugin.name for plugin in loading.registered(group)]
 
 
 def test_ours_come_through_the_same_door():
     assert {"sphere", "three_spheres", "ua", "mesh"} <= set(names())
-    assert {"grid", "fourier"} <= set(names(plugins.FIELDS))
-    assert {"profile", "shell"} <= set(names(plugins.RENDERERS))
+    assert {"grid", "fourier"} <= set(names(loading.FIELDS))
+    assert {"profile", "shell"} <= set(names(loading.RENDERERS))
     assert names() == sorted(names())
 
 
 def test_an_installed_distribution_is_found_and_makes_its_scene(plugin):
-    (found,) = [p for p in plugins.registered(plugins.SCENES) if p.name == "fixture_bar"]
+    (found,) = [p for p in loading.registered(loading.SCENES) if p.name == "fixture_bar"]
     assert (found.distribution, found.version) == ("sononerf-fixture", "1.0")
     assert "fixture_bar" not in sys.modules  # looking up imports nothing
-    factory = plugins.load(plugins.SCENES, "fixture_bar")
-    options = plugins.check_options(factory, {"length": 0.05}, where="scene.options")
+    factory = loading.load(loading.SCENES, "fixture_bar")
+    options = loading.check_options(factory, {"length": 0.05}, where="scene.options")
     assert options == {"length": 0.05, "radius": 0.01}
     scene = factory(**options)
     assert scene.mesh.is_watertight
@@ -78,10 +78,10 @@ def test_an_unknown_name_lists_what_there_is():
     with pytest.raises(
         SettingsError, match="unknown scene 'sphrere'; did you mean sphere"
     ) as caught:
-        plugins.load(plugins.SCENES, "sphrere")
+        loading.load(loading.SCENES, "sphrere")
     assert "three_spheres" in str(caught.value)
     with pytest.raises(SettingsError, match="unknown field 'zzz'; there are:"):
-        plugins.load(plugins.FIELDS, "zzz")
+        loading.load(loading.FIELDS, "zzz")
 
 
 @pytest.mark.parametrize(
@@ -90,39 +90,39 @@ def test_an_unknown_name_lists_what_there_is():
 def test_a_broken_plugin_hurts_only_who_asks_for_it(install, text):
     install("broken", {"broken": "plugin_broken:make"}, {"plugin_broken": text})
     assert "broken" in names()
-    assert callable(plugins.load(plugins.SCENES, "sphere"))
+    assert callable(loading.load(loading.SCENES, "sphere"))
     with pytest.raises(
         InputError, match=r"scene 'broken' of broken 2\.0 cannot be loaded"
     ) as caught:
-        plugins.load(plugins.SCENES, "broken")
+        loading.load(loading.SCENES, "broken")
     assert "\n" not in str(caught.value)
 
 
 def test_a_plugin_without_its_factory(install):
     install("hollow", {"hollow": "plugin_hollow:make"}, {"plugin_hollow": ""})
     with pytest.raises(InputError, match="cannot be loaded: AttributeError"):
-        plugins.load(plugins.SCENES, "hollow")
+        loading.load(loading.SCENES, "hollow")
 
 
 def test_a_plugin_that_is_no_factory(install):
     install("number", {"number": "plugin_number:x"}, {"plugin_number": "x = 3"})
     with pytest.raises(InputError, match="is int, expected a function or class"):
-        plugins.load(plugins.SCENES, "number")
+        loading.load(loading.SCENES, "number")
 
 
 def test_two_claims_of_one_name_matter_only_when_it_is_asked_for(install):
     for owner in ("first", "second"):
         install(owner, {"twin": f"plugin_{owner}:make"}, {f"plugin_{owner}": "def make(): ..."})
-    assert callable(plugins.load(plugins.SCENES, "sphere"))
+    assert callable(loading.load(loading.SCENES, "sphere"))
     with pytest.raises(SettingsError, match=r"claimed by first 2\.0 and second 2\.0"):
-        plugins.load(plugins.SCENES, "twin")
+        loading.load(loading.SCENES, "twin")
 
 
 def test_the_same_distribution_seen_twice_is_one_claim(install, tmp_path, monkeypatch):
     install("once", {"once": "plugin_once:make"}, {"plugin_once": "def make(): ..."})
     distribution(tmp_path / "again", "once", {"once": "plugin_once:make"})
     monkeypatch.syspath_prepend(tmp_path / "again")
-    assert callable(plugins.load(plugins.SCENES, "once"))
+    assert callable(loading.load(loading.SCENES, "once"))
 
 
 def factory(
@@ -139,7 +139,7 @@ class Factory:
 
 
 def check(options, target=factory, **more):
-    return plugins.check_options(target, options, where="field.options", **more)
+    return loading.check_options(target, options, where="field.options", **more)
 
 
 def test_options_are_filled_in_and_converted():
@@ -195,7 +195,7 @@ def test_options_are_told_with_default_and_bounds():
     ):
         """A factory of all sorts."""
 
-    assert [tuple(row.values()) for row in plugins.describe_options(many)] == [
+    assert [tuple(row.values()) for row in loading.describe_options(many)] == [
         ("size", None, True, "a number above 0 to 2"),
         ("place", [0, 1, 2], False, "3 of: a number"),
         ("kind", "a", False, "a, b"),
@@ -242,4 +242,4 @@ def test_a_factory_that_raises_is_one_line(raised, error, message):
         raise raised
 
     with pytest.raises(error, match=message):
-        plugins.call("field 'mine'", factory, None, levels=3)
+        loading.call("field 'mine'", factory, None, levels=3)

@@ -9,16 +9,16 @@ import pytest
 
 from sononerf.errors import SettingsError
 from sononerf.settings import loading
-from sononerf.settings.call_presets import CALL_PRESETS
-from sononerf.settings.import_schema import read_import_settings
 from sononerf.settings.loading import (
     apply_override,
     dump_yaml,
     load_settings,
+    read_import_settings,
     read_yaml,
     validate_settings,
 )
 from sononerf.settings.schema import CallSettings, Settings
+from sononerf.settings.sections import CALL_PRESETS
 
 SCENE = "scene: {name: sphere}\n"
 

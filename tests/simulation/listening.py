@@ -5,8 +5,8 @@ import numpy as np
 import trimesh
 
 from sononerf.head.ears import Ears
+from sononerf.head.front_end import echo_samples
 from sononerf.head.head import Head
-from sononerf.head.spectrogram import echo_samples
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.simulation.hearing import Hearing

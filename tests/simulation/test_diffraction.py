@@ -11,7 +11,7 @@ from sononerf.geometry.raycast import RayCaster
 from sononerf.scene.material import RIGID
 from sononerf.scene.scene import Scene
 from sononerf.simulation.diffraction import Diffraction, diffracting_edges, wedge_directivity
-from sononerf.simulation.reflection import reflection
+from sononerf.simulation.paths import reflection
 from tests.simulation.exact import SPEED, disc_on_axis
 from tests.simulation.judges import Case
 from tests.simulation.listening import (

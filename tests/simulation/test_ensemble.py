@@ -14,10 +14,9 @@ import trimesh
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.run.build import simulator_of
-from sononerf.scene.scene import Scene, load_scene
+from sononerf.scene.scene import Scene, check_aim, check_poses, check_reach, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation.ensemble import simulate_ensemble
-from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
 SEED_OF = partial(pose_seed, 5)

@@ -4,8 +4,8 @@ import pytest
 
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.head.ears import beam_gain, ear_gain, ear_tables
+from sononerf.head.front_end import echo_samples
 from sononerf.head.head import Head
-from sononerf.head.spectrogram import echo_samples
 from sononerf.settings.schema import EarSettings, SpectrogramSettings
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sononerf.head.ears import NOTCH_WIDTH
-from sononerf.head.spectrogram import echo_samples
+from sononerf.head.front_end import echo_samples
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.simulation.impulse_response import air_loss, deposit, plan_synthesis, synthesise
 

@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.echoes.layout import chunk_path
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.store import EnsembleStore, chunk_path
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import Ears
 from sononerf.progress import Progress
@@ -12,8 +11,7 @@ from sononerf.run.build import simulator_of
 from sononerf.run.simulate import simulate
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation import accuracy
-from sononerf.simulation.accuracy import settle_rays
+from sononerf.simulation import simulator as module
 from sononerf.simulation.hearing import Arrival
 from sononerf.simulation.low_band import (
     HeadPoses,
@@ -22,7 +20,7 @@ from sononerf.simulation.low_band import (
     resolved_frequency,
     sources_worth,
 )
-from sononerf.simulation.simulator import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses, settle_rays
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.judges import Case
 from tests.simulation.listening import ball, hearing, spectrum
@@ -233,7 +231,7 @@ def settled(wanted, progress=QUIET):
 
 @pytest.fixture
 def few(monkeypatch):
-    monkeypatch.setattr(accuracy, "FIRST", 500)
+    monkeypatch.setattr(module, "FIRST", 500)
 
 
 @pytest.mark.slow
@@ -244,7 +242,7 @@ def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
         # At four other poses than those of the trials.
         assert store.attributes["noise_floor_mae_db_active"] < 1.5 * wanted
         rays.append(store.attributes["rays"])
-    assert 500 <= rays[0] < rays[1] < accuracy.MOST
+    assert 500 <= rays[0] < rays[1] < simulator.MOST
 
 
 def test_noise_of_the_ears_asks_for_no_more_rays(few):

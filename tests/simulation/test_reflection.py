@@ -16,7 +16,7 @@ from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.ensemble import echo_hash, simulate
 from sononerf.simulation.hearing import hearing_of
 from sononerf.simulation.low_band import HeadPoses
-from sononerf.simulation.reflection import leave, lobe_exponent, reflection, unfaded
+from sononerf.simulation.paths import leave, lobe_exponent, reflection, unfaded
 from sononerf.simulation.simulator import Simulator
 from tests.simulation.judges import Case, heard
 from tests.simulation.listening import ball

@@ -12,7 +12,7 @@ SCRIPT = """
 import numpy as np
 from contextlib import closing
 from sononerf.geometry.poses import Poses
-from sononerf.simulation.workers import simulated
+from sononerf.simulation.simulator import simulated
 from tests.simulation.test_workers import Loud
 
 poses = Poses(np.zeros((64, 3)), np.tile(np.eye(3), (64, 1, 1)))

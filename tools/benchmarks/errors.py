@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from sononerf import open_run, reconstruct
-from sononerf.evaluation.geometry import signed_error
+from sononerf.evaluation.numbers import signed_error
 from sononerf.numerics import Floats
+from sononerf.refinement.optics import Optics
+from sononerf.refinement.reconstruction import starts_of
+from sononerf.refinement.surface_error import surface_error
 from sononerf.run.build import true_mesh
 from sononerf.run.run import Run
-from sononerf.surface.reconstruction import starts_of
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.surface_error import surface_error
 from tools.benchmarks.experiment import Row, aligned
 
 DRAWN = 2000

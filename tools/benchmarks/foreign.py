@@ -22,11 +22,10 @@ from torch import Tensor
 
 import sononerf
 from sononerf import storage
-from sononerf.evaluation.metrics import geometry_metrics
-from sononerf.evaluation.solid import Solid
+from sononerf.evaluation.metrics import Solid, geometry_metrics
+from sononerf.refinement.reconstruction import starts_of
+from sononerf.refinement.refine import Saved
 from sononerf.settings.loading import load_settings
-from sononerf.surface.reconstruction import starts_of
-from sononerf.surface.refine.refinement import Saved
 from tools.benchmarks.experiment import (
     CONFIG,
     STOPPED,

@@ -28,8 +28,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from sononerf import storage
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
+from sononerf.field.fields import FourierField
 from sononerf.field.fitting import quiet_lightning, usable_accelerator
-from sononerf.field.fourier import FourierField
 from sononerf.field.module import EchoModule
 from sononerf.field.renderer import ShellRenderer
 from sononerf.progress import Progress

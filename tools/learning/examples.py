@@ -18,15 +18,15 @@ from scipy.ndimage import map_coordinates
 
 import sononerf
 from sononerf import storage
+from sononerf.echoes.detection import RangeLevels
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import SonoNerfError
-from sononerf.evaluation.solid import Solid
+from sononerf.evaluation.metrics import Solid
 from sononerf.geometry.lattice import Lattice
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
-from sononerf.surface.start.features import PlaceFeatures, features_of, free_places
-from sononerf.surface.start.network import lattice_of
+from sononerf.start.features import PlaceFeatures, features_of, free_places
+from sononerf.start.network import lattice_of
 from tools.learning.bodies import body
 
 Axes = tuple[int, ...]

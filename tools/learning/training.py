@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from sononerf import storage
 from sononerf.errors import InputError
-from sononerf.surface.start.network import LOGIT, OUTSIDE, StartNetwork
+from sononerf.start.network import LOGIT, OUTSIDE, StartNetwork
 from tools.learning.examples import Crop, draw, load_example
 
 SIDE = 40

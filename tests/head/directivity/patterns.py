@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import scipy.io
 
-from sononerf.head.directivity.record import Directivity, unit_vectors
+from sononerf.head.directivity import Directivity, unit_vectors
 
 AZIMUTH = np.arange(-90.0, 91.0, 10.0)
 ELEVATION = np.arange(-80.0, 81.0, 10.0)

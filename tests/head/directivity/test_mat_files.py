@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.directivity_files import read_matlab
+from sononerf.head.directivity_files import read_matlab
 from tests.head.directivity.patterns import (
     AZIMUTH,
     FREQUENCY,

@@ -8,13 +8,8 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.head.directivity.directivity_files import (
-    content_hash,
-    read_csv,
-    read_directivity,
-    write_sofa,
-)
-from sononerf.head.directivity.record import interpolation, unit_vectors
+from sononerf.head.directivity import interpolation, unit_vectors
+from sononerf.head.directivity_files import content_hash, read_csv, read_directivity, write_sofa
 from tests.head.directivity.patterns import (
     FREQUENCY,
     batslam_fields,

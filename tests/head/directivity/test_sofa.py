@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.directivity_files import read_sofa
+from sononerf.head.directivity_files import read_sofa
 from tests.head.directivity.patterns import FREQUENCY, PLACES, pair
 from tests.head.directivity.sofa_files import written
 

@@ -4,7 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sononerf.head.directivity.directivity_files import read_sofa, write_sofa
+from sononerf.head.directivity_files import read_sofa, write_sofa
 from sononerf.head.ears import ear_tables
 from sononerf.settings.schema import EarSettings
 from tests.head.directivity.patterns import pair

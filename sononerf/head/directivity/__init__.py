@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Measured directivities: readers of several formats, one record, one writer."""

@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: MIT
+r"""Spectrograms of a surface by physical optics, with gradients for its vertices.
+
+Each vertex stands for a small piece of surface with the vector area **a** (outward). An ear hears
+
+.. math::
+    p(f) = \sum \frac{j f (1 - j \epsilon)}{c}\,
+    \frac{\cos\vartheta_1 + \cos\vartheta_2}{2}\, \frac{a}{d_1 d_2}\, v\, B\, E\,
+    e^{-\alpha (d_1 + d_2)}\, e^{-(k s)^2 / 2}\, e^{-\epsilon k \delta}\,
+    e^{-j k (d_1 + d_2)}
+
+with the distances :math:`d_1, d_2` from the emitter and to the ear, the visibility v, the gains
+B, E of beam and ear, the absorption :math:`\alpha`, the standard deviation s of the path's length
+over the piece, and the fade over the detour :math:`\delta` against the local mirror path, as in
+the simulator (:mod:`sononerf.simulation.paths`). Everything between path and spectrogram is
+linear and fixed but the last magnitude.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sononerf.head.head import Head
+from sononerf.refinement.filter_bank import Arrivals, FilterBank, Source, fast_length
+from sononerf.refinement.remesh import tangents
+from sononerf.simulation.hearing import Hearing, hearing_of
+
+FADE_FREQUENCY = 0.25
+"""Frequency below which the fade no longer falls, over the highest analysed frequency: as in the
+simulator, 25 of 100 kHz."""
+SILENT = 3.0
+"""Exponent of fade and spread at the lowest analysed frequency above which a piece is left out: 26
+dB down. Such pieces cancel one another."""
+SPREAD = 5.0 / 52.0
+"""Variance of the path over a piece of area 1 and slope 1: between that of a hexagon and that of a
+triangle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """Rendered spectrograms of some poses, over the ranges that hold echoes."""
+
+    power: Tensor  # (P, E, W, F) float32: Squared magnitude; gradients flow through it
+    row: Tensor  # (P,): Index of the first range slice on the store's axis; may be below zero
+
+
+@dataclass(frozen=True, eq=False)
+class Heads:
+    """Emitters and receivers. Each pose appears W times, once for each way of the sound.
+
+    Without a support there is one way, from the emitter to the ears. On a support there are four:
+    emitter and ears stand for themselves or are mirrored.
+    """
+
+    emitters: Tensor  # (W P, 3), m: Their places
+    ears: Tensor  # (W P, E, 3), m: Places of the ears
+    emitting: Tensor  # W P, 3, 3: Head to world, of emitter and ears; those of images mirror
+    hearing: Tensor
+    poses: int  # P
+
+    def about(self, middle: Tensor) -> Heads:
+        """Return them in single precision, counted from a place (3,), m."""
+        emitters, ears = (self.emitters - middle).float(), (self.ears - middle).float()
+        return Heads(emitters, ears, self.emitting.float(), self.hearing.float(), self.poses)
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Echoes of surface pieces at some poses, one row per way of a pose and vertex."""
+
+    pose: Tensor  # (Q,): Row of :class:`Heads`, one for each way of a pose; vertex
+    vertex: Tensor
+    weight: Tensor  # (Q, E, N) float32: Gains, absorption, spread, fade and visibility at the nodes
+    # (Q, E) float32: Fade and spread at the lowest analysed frequency, 0 to 1; 1 at a mirror point
+    reach: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Ways of the sound of a pose by a place to its ears."""
+
+    pose: Tensor  # (Q,): Row of :class:`Heads`
+    strength: Tensor  # (Q, E) float32: Gradients run to it, to the length and to the weight
+    length: Tensor  # (Q, E) float32, m: From the emitter to the ear
+    weight: Tensor  # (Q, E, N) float32: Factors at the nodes
+
+
+class Optics(nn.Module):
+    """Physical optics of one head; constant tensors move with the module.
+
+    Attributes:
+        head: Without noise.
+        plane: The support; None if there is none.
+        wavelength (m): The shortest of the analysed band.
+        rows, ears: Range slices of a spectrogram, R, and ears, E.
+        kept_nodes (N,): Indices of the synthesis' nodes that the band needs.
+    """
+
+    def __init__(self, head: Head, hearing: Hearing | None = None) -> None:
+        super().__init__()
+        self.head = head.without_noise()
+        self.plane = head.plane
+        hearing, analysis = hearing or hearing_of(self.head), head.analysis
+        self.analysis = analysis
+        self.speed_of_sound = head.speed_of_sound
+        rate = analysis.sampling_rate
+        rows = head.frequency
+        self.frequencies = rows
+        self.ears = len(head.receivers)
+        axis = head.range
+        self.rows = len(axis)
+        filters = head.row_filters
+        start = axis[0] * 2.0 * rate / self.speed_of_sound - filters.centre
+        self._first = round(start / analysis.hop)
+        self.wavelength = head.wavelength
+        self._reads = filters.envelope.shape[1]
+        self._soft = FADE_FREQUENCY * float(rows[-1])
+        self.bank = FilterBank(head, hearing.synthesis.nodes, self._soft)
+        self.kept_nodes = self.bank.kept_nodes
+        ring = rate / self.bank.spacing + max(0, head.window.shape[1] - self._reads) / 2.0
+        self._pad = math.ceil(ring)
+        nodes = hearing.synthesis.nodes[self.kept_nodes]
+        turn = 2.0 * math.pi / self.speed_of_sound
+        decay = hearing.absorption[self.kept_nodes] * (math.log(10.0) / 20.0)
+        tables = hearing.ears._by_direction[:, :, self.kept_nodes]
+        self._grid = (len(hearing.ears.elevation), len(hearing.ears.azimuth))
+        lowest = float(rows[0])
+        for name, values in (
+            ("wavenumber", turn * nodes),
+            ("fade", turn * np.hypot(nodes, self._soft)),
+            ("decay", decay),
+            ("tables", tables),
+            ("emitter", hearing.ears.emitter),
+            ("places", hearing.ears.positions),
+        ):
+            self.register_buffer(name, torch.as_tensor(np.ascontiguousarray(values)).float())
+        self._lowest = (turn * lowest, turn * math.hypot(lowest, self._soft))
+
+    def heads(self, positions: Tensor, rotations: Tensor) -> Heads:
+        """Return emitters and ears of poses (P, 3), m, and (P, 3, 3), with their images."""
+        emitter = self.get_buffer("emitter").to(positions.dtype)
+        places = self.get_buffer("places").to(positions.dtype)
+        emitters = positions + rotations @ emitter
+        ears = positions[:, None] + torch.einsum("pij,ej->pei", rotations, places)
+        if (plane := self.plane) is None:
+            return Heads(emitters, ears, rotations, rotations, len(positions))
+        turn = torch.as_tensor(plane.turn).to(positions)
+        normal = torch.tensor(plane.normal).to(positions)
+
+        def both(points: Tensor) -> tuple[Tensor, Tensor]:
+            return points, points - 2.0 * plane.height(points)[..., None] * normal
+
+        from_, to = both(emitters), both(ears)
+        turned = rotations, turn @ rotations
+        ways = ((0, 0), (1, 0), (0, 1), (1, 1))
+        return Heads(
+            torch.cat([from_[one] for one, _ in ways]),
+            torch.cat([to[other] for _, other in ways]),
+            torch.cat([turned[one] for one, _ in ways]),
+            torch.cat([turned[other] for _, other in ways]),
+            len(positions),
+        )
+
+    def near_mirror(
+        self, points: Tensor, area: Tensor, bending: Tensor, emitters: Tensor, ears: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return which pieces send sound towards an ear, and their attenuation.
+
+        In: points, area (..., 3), bending ((..., 6), 1/m), emitters, ears ((..., 3), m). Out:
+        facing (...,), spread, detour, path, exponent (...,).
+        """
+        size = area.norm(dim=-1)
+        normal = area / size.clamp_min(1e-18)[..., None]  # squares of less are zero in float32
+        u, v = points - emitters, points - ears
+        d1, d2 = u.norm(dim=-1), v.norm(dim=-1)
+        u, v = u / d1[..., None], v / d2[..., None]
+        rise, back = -(u * normal).sum(-1), -(v * normal).sum(-1)
+        shape = normal.shape[:-1]
+        first, second = (t.reshape(*shape, 3) for t in tangents(normal.reshape(-1, 3)))
+        u1, u2 = (u * first).sum(-1), (u * second).sum(-1)
+        v1, v2 = (v * first).sum(-1), (v * second).sum(-1)
+        g1, g2 = u1 + v1, u2 + v2
+        xx, yy, zz, xy, xz, yz = bending.unbind(-1)
+
+        def bent(a: Tensor, b: Tensor) -> Tensor:
+            a1, a2, a3 = a.unbind(-1)
+            b1, b2, b3 = b.unbind(-1)
+            found = a1 * b1 * xx + a2 * b2 * yy + a3 * b3 * zz + (a1 * b2 + a2 * b1) * xy
+            return found + (a1 * b3 + a3 * b1) * xz + (a2 * b3 + a3 * b2) * yz
+
+        both = rise + back
+        h11 = (1 - u1 * u1) / d1 + (1 - v1 * v1) / d2 + both * bent(first, first)
+        h22 = (1 - u2 * u2) / d1 + (1 - v2 * v2) / d2 + both * bent(second, second)
+        h12 = -u1 * u2 / d1 - v1 * v2 / d2 + both * bent(first, second)
+        # |H|^-1 = a I + b H, such that both eigenvalues fit; none softer than a flat surface.
+        least = rise.square().clamp_min(1e-4) / d1 + back.square().clamp_min(1e-4) / d2
+        middle, half = 0.5 * (h11 + h22), torch.hypot(0.5 * (h11 - h22), h12)
+        high = 1.0 / torch.maximum((middle + half).abs(), least)
+        low = 1.0 / torch.maximum((middle - half).abs(), least)
+        b = (high - low) / (2.0 * half).clamp_min(1e-6 * least)
+        a = high - b * (middle + half)
+        slope = g1 * g1 + g2 * g2
+        detour = 0.5 * (a * slope + b * (h11 * g1 * g1 + h22 * g2 * g2 + 2.0 * h12 * g1 * g2))
+        detour = detour.clamp_min(0.0)
+        spread = SPREAD * slope * size
+        k, fade = self._lowest
+        exponent = 0.5 * k * k * spread + fade * detour
+        return (rise > 0) & (back > 0), spread, detour, d1 + d2, exponent
+
+    def gains(self, table: Tensor, directions: Tensor, rotations: Tensor) -> Tensor:
+        """Gain (Q, N) of tables (Q,) towards world directions (Q, 3); 0 is the beam, then ears."""
+        head = torch.einsum("qi,qij->qj", directions, rotations)
+        x, y, z = head.unbind(1)
+        rows, columns = self._grid
+        across = (torch.atan2(y, x) / (2.0 * math.pi) + 0.5) * (columns - 1)
+        upward = (torch.atan2(z, torch.hypot(x, y)) / math.pi + 0.5) * (rows - 1)
+        column = across.long().clamp(0, columns - 2)
+        row = upward.long().clamp(0, rows - 2)
+        s, t = across - column, upward - row
+        corner = (table * rows + row) * columns + column
+        corners = torch.stack([corner, corner + 1, corner + columns, corner + columns + 1], dim=1)
+        weights = torch.stack([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t], dim=1)
+        flat = self.get_buffer("tables").flatten(0, 1)
+        return nn.functional.embedding_bag(corners, flat, per_sample_weights=weights, mode="sum")
+
+    def pieces(
+        self,
+        points: Tensor,
+        area: Tensor,
+        bending: Tensor,
+        pose: Tensor,
+        vertex: Tensor,
+        visible: Tensor,
+        heads: Heads,
+    ) -> Pieces:
+        """Return pieces with their weights: all factors of the sum but path, obliquity and area.
+
+        In: points, area, bending ((V, 3), (V, 3), (V, 6) float32), pose, vertex (Q,), visible ((Q,
+        E) float32).
+        """
+        emitters, ears = heads.emitters, heads.ears
+        place, normal, bent = points[vertex], area[vertex], bending[vertex]
+        out = place - emitters[pose]
+        out = out / out.norm(dim=1, keepdim=True)
+        turned = heads.hearing[pose]
+        beam = self.gains(torch.zeros_like(pose), out, heads.emitting[pose])
+        weights, reaches = [], []
+        wavenumber, fade, decay = (
+            self.get_buffer(name) for name in ("wavenumber", "fade", "decay")
+        )
+        half = 0.5 * wavenumber.square()
+        for ear in range(self.ears):
+            to = ears[pose, ear]
+            facing, spread, detour, path, exponent = self.near_mirror(
+                place, normal, bent, emitters[pose], to
+            )
+            back = place - to
+            back = back / back.norm(dim=1, keepdim=True)
+            loss = torch.addr(spread[:, None] * half, detour, fade)
+            loss = torch.addr(loss, path, decay)
+            gain = self.gains(torch.full_like(pose, 1 + ear), back, turned) * beam
+            seen = visible[:, ear] * facing
+            weights.append(gain * torch.exp(-loss) * seen[:, None])
+            reaches.append(torch.exp(-exponent) * seen)
+        return Pieces(pose, vertex, torch.stack(weights, 1), torch.stack(reaches, 1))
+
+    def render(
+        self,
+        points: Tensor,
+        area: Tensor,
+        pieces: Pieces,
+        heads: Heads,
+        *,
+        edges: Paths | None = None,
+        stretch: Tensor | None = None,
+        late: Tensor | None = None,
+    ) -> Heard:
+        """Return the spectrograms of poses; gradients run to points and areas (V, 3) float32.
+
+        The sound by ``edges`` is added in phase. The paths of a pose are multiplied by ``stretch``
+        (P,) and lengthened by ``late`` (P,), m.
+        """
+        emitters, ears = heads.emitters, heads.ears
+        place, normal = points[pieces.vertex], area[pieces.vertex]
+        u = place - emitters[pieces.pose]
+        v = place[:, None] - ears[pieces.pose]
+        d1, d2 = u.norm(dim=1), v.norm(dim=2)
+        both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
+        strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
+        ways: dict[Source, Paths] = {
+            "surface": Paths(pieces.pose, strength, d1[:, None] + d2, pieces.weight)
+        }
+        if edges is not None:
+            ways["edge"] = edges
+        # Sound by different ways adds up in phase.
+        poses = heads.poses
+        pose = {source: some.pose % poses for source, some in ways.items()}
+        samples = self.analysis.sampling_rate / self.speed_of_sound
+        paths = {}
+        for source, some in ways.items():
+            path = some.length
+            if stretch is not None:
+                path = path * stretch[pose[source]][:, None]
+            if late is not None:
+                path = path + late[pose[source]][:, None]
+            paths[source] = path * samples
+        whole = torch.cat([path.detach() for path in paths.values()])
+        frames, row = self._span(whole, torch.cat([*pose.values()]), poses)
+        origin = (row + self._first) * self.analysis.hop
+        ear = torch.arange(self.ears, device=row.device)
+        arrivals = {}
+        for source, some in ways.items():
+            at = paths[source] - origin.to(paths[source].dtype)[pose[source]][:, None]
+            receiver = pose[source][:, None] * self.ears + ear
+            arrivals[source] = Arrivals(
+                some.strength.reshape(-1),
+                at.reshape(-1),
+                some.weight.flatten(0, 1),
+                receiver.reshape(-1),
+            )
+        power = self.bank.power(arrivals, receivers=poses * self.ears, frames=frames)
+        return Heard(power.unflatten(0, (poses, self.ears)), row)
+
+    def later_power(
+        self, pose: Tensor, ear: Tensor, delay: Tensor, weight: Tensor, like: Heard
+    ) -> Tensor:
+        """Power (P, E, W, F) of single echoes, on the rows of others.
+
+        In: pose, ear (N,), delay ((N,), s), weight ((N, N') float32).
+        """
+        poses, _, frames, _ = like.power.shape
+        start = ((like.row + self._first) * self.analysis.hop).to(delay.dtype)
+        at = delay * self.analysis.sampling_rate - start[pose]
+        last = frames * self.analysis.hop - self._pad
+        inside = torch.nonzero((at > self._pad) & (at < last))[:, 0]
+        at = at[inside].float()
+        receiver = (pose * self.ears + ear)[inside]
+        arrivals = Arrivals(torch.ones_like(at), at, weight[inside], receiver)
+        power = self.bank.power({"surface": arrivals}, receivers=poses * self.ears, frames=frames)
+        return power.unflatten(0, (poses, self.ears))
+
+    def _span(self, path: Tensor, pose: Tensor, poses: int) -> tuple[int, Tensor]:
+        """Return the number of frames that holds any pose's echoes, and each pose's first."""
+        hop, window = self.analysis.hop, self._reads
+        late, early = path.amax(1), path.amin(1)
+        huge = torch.full((poses,), torch.inf, device=path.device, dtype=path.dtype)
+        nearest = huge.scatter_reduce(0, pose, early, "amin")
+        farthest = (-huge).scatter_reduce(0, pose, late, "amax")
+        empty = torch.isinf(nearest)
+        nearest = torch.where(empty, torch.zeros_like(nearest), nearest)
+        farthest = torch.where(empty, torch.zeros_like(farthest), farthest)
+        row = torch.floor((nearest - self._pad - window) / hop).long()
+        span = float((farthest - row * hop).max()) + self._pad + window
+        frames = fast_length(max(math.ceil(span / hop), 8))
+        return frames, row - self._first

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Pictures: the only place that draws."""

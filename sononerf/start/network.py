@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: MIT
+"""Start surface by a network that reads the levels of all poses, without a fitted field.
+
+In: levels over range and onsets. Out: a closed mesh. Section 4 of ``docs/method.md``.
+
+Flat faces are silent except in the direction of a mirror, and a hollow is heard at its rim and its
+bottom alone, so the echoes do not determine the surface in between. A U-Net [1]_ takes the features
+of all places (:mod:`sononerf.start.features`) and returns the signed distance. It was
+trained on bodies of many kinds, each heard by poses all around, by few, from one side and from a
+belt. Averaging features over views before a 3D network makes the signed distance is the way of
+Atlas [2]_ for images. Lengths are in range resolutions and features are means over poses, so that
+size, band and number of poses may differ.
+
+References:
+    .. [1] O. Ronneberger, P. Fischer, T. Brox, "U-Net: convolutional networks for biomedical image
+       segmentation", 2015.
+    .. [2] Z. Murez et al., "Atlas: end-to-end 3D scene reconstruction from posed images", 2020.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from sononerf.echoes.detection import RangeLevels
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import NumericalError
+from sononerf.geometry.lattice import MARGIN, Lattice
+from sononerf.numerics import Floats, Ints, Singles
+from sononerf.start.features import FEATURES, PlaceFeatures, features_of, free_places
+from sononerf.start.occupancy import clearance_grid, surface_of, without_hollows, without_parts
+
+WEIGHTS = Path(__file__).with_name("network.safetensors")
+"""File of the trained weights, float16."""
+VOXEL = 0.25
+"""Spacing of the signed distance, range resolutions: walls of half a range resolution have two
+voxels. Features have twice this spacing."""
+LARGEST = 3_000_000
+"""Number of voxels, at most; a larger body gets a coarser lattice. The network takes about 1 µs of
+one core per voxel."""
+OUTSIDE = 4.0
+"""Distance outside of the lattice, voxels; the training clips larger ones to it."""
+FULLER = 0.4
+"""Distance outside of the surface at which the fuller one lies, voxels. A refinement thins a body
+but does not close gaps in it: four letters, refined from here, lose less of their strokes, with
+twice this distance they run together (``docs/notes/surface.md``)."""
+LOGIT = 0.7
+"""Distance at which the logit of the probability that a voxel is outside is 1, voxels; the same in
+the training."""
+SURE = 3.0
+"""Distance from which a voxel is taken to be outside, voxels. Farther voxels are many, and their
+small probabilities would add up."""
+BLOCK = 16
+"""Number of voxels along an axis that are one voxel at the coarsest level of the network."""
+PAIRS = 320
+"""Number of pose-ear pairs of one pass of the network, at most: as many as in the training. More
+are parted at random into lots, whose signed distances are averaged."""
+FRAMES = (((0, 1, 2), (1, 1, 1)), ((1, 2, 0), (-1, -1, 1)), ((2, 0, 1), (1, -1, -1)))
+"""Frames in which the network sees the lattice: order of the axes, and their signs. The mean over
+four frames raises the median F-score at 2 mm of 19 withheld bodies from 0.83 to 0.84, the least
+from 0.59 to 0.65; eight frames give no more."""
+CHANNELS = (48, 80, 112, 144)
+"""Channels of the network, from fine to coarse."""
+_ROOM = 1.0  # distance in front of the onsets that the lattice covers, steps of the search
+
+
+def lattice_of(hull: EchoHull, box: Floats, resolution: float) -> Lattice | None:
+    """Return the lattice over all places that the onsets leave; None if they leave none.
+
+    In: box ((2, 3), m), resolution (m).
+    """
+    step = max(resolution, float(np.prod(box[1] - box[0]) / LARGEST) ** (1 / 3))
+    coarse = Lattice.over(box[0], box[1], step)
+    left = np.argwhere(clearance_grid(hull, coarse) > -_ROOM * step)
+    if not len(left):
+        return None
+    lower = coarse.origin + coarse.spacing * (left.min(axis=0) - 1.5)
+    upper = coarse.origin + coarse.spacing * (left.max(axis=0) + 1.5)
+    spacing = max(VOXEL * resolution, float(np.prod(upper - lower) / LARGEST) ** (1 / 3))
+    blocks = np.ceil((upper - lower) / (BLOCK * spacing)).astype(int)
+    x, y, z = (int(n) * BLOCK for n in blocks)
+    origin = (lower + upper) / 2 - spacing * (np.array([x, y, z]) - 1) / 2
+    return Lattice(origin, spacing, (x, y, z))
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.n1, self.c1 = nn.GroupNorm(8, channels), nn.Conv3d(channels, channels, 3, padding=1)
+        self.n2, self.c2 = nn.GroupNorm(8, channels), nn.Conv3d(channels, channels, 3, padding=1)
+        for part in self.c2.parameters():
+            nn.init.zeros_(part)
+
+    def forward(self, values: Tensor) -> Tensor:
+        silu = nn.functional.silu
+        return values + self.c2(silu(self.n2(self.c1(silu(self.n1(values))))))
+
+
+def _blocks(channels: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*(_Residual(channels) for _ in range(count)))
+
+
+class StartNetwork(nn.Module):
+    """U-Net from features to the signed distance, eight voxels of it for each place.
+
+    It adds to the bound of free space.
+    """
+
+    def __init__(self, channels: tuple[int, ...] = CHANNELS) -> None:
+        super().__init__()
+        first, steps = channels[0], list(pairwise(channels))
+        self.enter = nn.Sequential(
+            nn.Conv3d(FEATURES, 2 * first, 1), nn.SiLU(), nn.Conv3d(2 * first, first, 1)
+        )
+        self.down = nn.ModuleList(_blocks(c, 1 if c == first else 2) for c in channels)
+        self.pool = nn.ModuleList(nn.Conv3d(a, b, 2, stride=2) for a, b in steps)
+        self.widen = nn.ModuleList(
+            nn.ConvTranspose3d(b, a, 2, stride=2) for a, b in reversed(steps)
+        )
+        self.up = nn.ModuleList(_blocks(a, 1 if a == first else 2) for a, _ in reversed(steps))
+        self.leave = nn.Sequential(nn.GroupNorm(8, first), nn.SiLU(), nn.Conv3d(first, 8, 1))
+
+    def forward(self, features: Tensor, bound: Tensor) -> Tensor:
+        """Return the signed distance, voxels, positive outside, (B, 2X, 2Y, 2Z).
+
+        In: features (B, FEATURES, X, Y, Z), bound ((B, X, Y, Z), voxels).
+        """
+        batch, _, x, y, z = features.shape
+        values = self.enter(features.contiguous(memory_format=torch.channels_last_3d))
+        levels = [self.down[0](values)]
+        for pool, down in zip(self.pool, self.down[1:], strict=True):
+            levels.append(down(pool(levels[-1])))
+        values = levels.pop()
+        for widen, up in zip(self.widen, self.up, strict=True):
+            values = up(widen(values) + levels.pop())
+        values_out = self.leave(values).float().unflatten(1, (2, 2, 2))
+        values_out = values_out.permute(0, 4, 1, 5, 2, 6, 3).reshape(batch, 2 * x, 2 * y, 2 * z)
+        free = nn.functional.interpolate(
+            bound[:, None].clamp(-6, 6), scale_factor=2, mode="trilinear", align_corners=False
+        )
+        return 2.0 * values_out + free[:, 0]
+
+
+def trained_network() -> StartNetwork:
+    """Return the network with the weights of the package."""
+    network = StartNetwork()
+    network.load_state_dict({name: part.float() for name, part in load_file(WEIGHTS).items()})
+    return network.eval()
+
+
+_network = cache(trained_network)
+
+
+def expected_level(distance: Singles) -> float:
+    """Return the level at which the volume is the expected one, voxels.
+
+    A wire whose place is known less exactly than it is thick is nowhere likelier than air, so that
+    the level 0 would lose it.
+
+    In: distance ((X, Y, Z), voxels).
+    """
+    near = distance[distance < SURE].astype(np.float64)
+    expected = int((1 / (1 + np.exp(near / LOGIT))).sum())
+    return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE
+
+
+def lots_of(levels: RangeLevels) -> list[Ints]:
+    """Return the poses of each pass, parted at random; the order of the poses does not matter."""
+    poses = np.lexsort(levels.emitters.T)
+    count = max(1, -(-levels.level[:, :, 0, 0].size // PAIRS))
+    count = min(count, len(poses))
+    return np.array_split(np.random.default_rng(0).permutation(poses), count)
+
+
+def signed_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) -> Singles:
+    """Return the signed distance by the network, (X, Y, Z) voxels, positive outside."""
+    free = free_places(hull, lattice)
+    lots = [features_of(levels, some, hull, lattice, free) for some in lots_of(levels)]
+    passes = max(len(FRAMES), len(lots))
+    total, times = np.zeros((len(lots), *lattice.shape), np.float32), np.zeros(len(lots))
+    for number in range(passes):
+        lot, frame = number % len(lots), FRAMES[number % len(FRAMES)]
+        total[lot] += _in_frame(lots[lot], *frame)
+        times[lot] += 1
+    return np.asarray((total / times[:, None, None, None]).mean(axis=0), dtype=np.float32)
+
+
+def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, ...]) -> Singles:
+    """Return what the network makes of features in a turned or mirrored frame, turned back."""
+    seen, bound = places.turned(order, signs)
+    with torch.no_grad():
+        made = _network()(torch.from_numpy(seen)[None], torch.from_numpy(bound)[None])
+    back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
+    return np.flip(made[0].numpy(), back).transpose(np.argsort(order))
+
+
+def levels_surfaces(
+    levels: RangeLevels | None, hull: EchoHull, box: Floats, resolution: float
+) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """Return the closed surface of the body by the network, and a fuller one, m, normals outward.
+
+    In: box ((2, 3), m), resolution (m).
+    """
+    if levels is None:
+        raise NumericalError("the start levels needs the echoes; their free space is not enough")
+    plane = hull.plane
+    if plane is not None:
+        levels, hull = levels.with_images(plane, len(hull.first)), hull.with_images()
+        corners = np.stack(np.meshgrid(*np.transpose(box), indexing="ij"), -1).reshape(-1, 3)
+        corners = np.concatenate([corners, plane.mirrored(corners)])
+        box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    lattice = lattice_of(hull, box, resolution)
+    if lattice is None:
+        raise NumericalError("no surface: the first echoes leave no room for a body")
+    distance = signed_distance(levels, hull, lattice)
+    if plane is not None:
+        height = plane.height(lattice.points()).reshape(lattice.shape) / lattice.spacing
+        distance = np.maximum(distance, -height).astype(np.float32)
+    if not (distance < SURE).any():
+        raise NumericalError("no surface: the network finds no body in the levels of the echoes")
+    level = expected_level(distance)
+    return _at_level(distance, level, lattice), _at_level(distance, level + FULLER, lattice)
+
+
+def _at_level(distance: Singles, level: float, lattice: Lattice) -> trimesh.Trimesh:
+    """Return the closed surface where a signed distance has a level, voxels."""
+    x, y, z = (n + 2 * MARGIN for n in lattice.shape)
+    wider = Lattice(lattice.origin - MARGIN * lattice.spacing, lattice.spacing, (x, y, z))
+    distance = np.pad(np.minimum(distance - level, OUTSIDE), MARGIN, constant_values=OUTSIDE)
+    return surface_of(without_parts(without_hollows(distance), wider, None), wider)

@@ -1,0 +1,499 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import InputError
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.head.head import Head
+from sononerf.refinement import objective as objectives_module
+from sononerf.refinement import refine as module
+from sononerf.refinement.candidates import Candidate, best_of, planned
+from sononerf.refinement.descent import Descent, Stage, poses_that_hear
+from sononerf.refinement.objective import Level, OnsetRanges
+from sononerf.refinement.optics import Optics
+from sononerf.refinement.refine import Refinement
+from sononerf.refinement.remesh import distance_from, remesh
+from sononerf.run.build import head_of
+from sononerf.scene.scene import Scene
+from sononerf.simulation.hearing import Hearing, hearing_of
+from sononerf.simulation.simulator import Simulator
+from tests.memory import changed, deaf_hull, echoes_of
+from tests.refinement.conftest import RADIUS
+from tests.refinement.test_objective import heard as onsets_of
+
+
+def unasked(mesh):
+    raise AssertionError("no stage asks for the simulator")
+
+
+def refined(meshes, echoes, optics, *, simulate=unasked, stages=None, **given):
+    return Refinement(
+        meshes if isinstance(meshes, dict) else {"body": meshes},
+        echoes,
+        optics,
+        simulate=simulate,
+        seed=1,
+        stages=stages or SHORT,
+        **given,
+    ).run()
+
+
+def begun(meshes, echoes, optics, **given):
+    return Refinement(
+        meshes, echoes, optics, simulate=unasked, seed=1, **{"stages": SHORT, **given}
+    )
+
+
+SHORT = (
+    Stage(smoothing=2.0, edge=0.8, blur=0.3, rate=0.02, steps=8, beyond="trace"),
+    Stage(smoothing=1.2, edge=0.7, blur=0.0, rate=0.02, steps=8, beyond="keep"),
+)
+
+
+def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, echoes, optics):
+    tilt = np.linspace(0.3, 3.0, len(optics.frequencies)).astype(np.float32)
+    tilted = changed(
+        echoes, read=lambda n: echoes.store.read_pose(n) * tilt, hull=deaf_hull(), origin="recorded"
+    )
+    work = begun({"body": bumpy}, tilted, optics)
+    work.first_stage()
+    assert work.candidates[0].drawn == SHORT[0].steps  # the next stage begins with other poses
+    gain = work.candidates[0].level.gain[0].exp().numpy()
+    assert gain[-1] / gain[0] > 5.0
+
+
+@pytest.fixture(autouse=True)
+def few_rays(monkeypatch):
+    monkeypatch.setattr(objectives_module, "RAYS", 4000)
+
+
+@pytest.fixture(scope="module")
+def bumpy():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    way = np.asarray(mesh.vertices) / RADIUS
+    height = 4e-4 * (1 + np.sin(5 * way[:, 0] + 1) * np.cos(4 * way[:, 1]))
+    return trimesh.Trimesh(way * (RADIUS + height)[:, None], mesh.faces, process=False)
+
+
+def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
+    found = refined(bumpy, echoes, optics)
+    assert found.kept
+    assert len(found.confidence) == len(found.mesh.vertices)
+    assert found.gain.shape == (2, len(optics.frequencies))
+    assert [(one["stage"], one["way"]) for one in found.history][:2] == [
+        (0, "blurred"),
+        (0, "sharp"),
+    ]
+    assert [one["stage"] for one in found.history] == [0, 0, 1]
+
+    def off(mesh):
+        return np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean()
+
+    assert off(found.mesh) < 0.5 * off(bumpy)
+
+
+def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
+    half = bumpy.copy().apply_scale(0.5)
+    for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
+        work = begun(starts, echoes, optics)
+        assert [(one.start, one.way) for one in work.candidates] == [
+            ("whole", "blurred"),
+            ("whole", "sharp"),
+        ]
+        (mesh,) = work.candidates[0].meshes
+        np.testing.assert_array_equal(mesh.vertices, bumpy.vertices)
+
+
+@pytest.mark.parametrize(("count", "chosen"), [(20, "filled"), (1000, "hull")])
+def test_a_hull_takes_part_only_if_poses_are_dense(bumpy, echoes, optics, count, chosen):
+    places = 0.4 * fibonacci_sphere(count)
+    ears = np.repeat(places[:, None], 2, axis=1)
+    far = np.linalg.norm(places[:, None] - bumpy.vertices, axis=2).min(axis=1)
+    heard = EchoHull(places, ears, np.stack([far, far], axis=1), -places / 0.4)
+    echoes = changed(echoes, hull=heard)
+    starts = {"hull": bumpy, "filled": bumpy.copy().apply_scale(0.5)}
+    for given, found in ((starts, chosen), ({"hull": bumpy}, "hull")):
+        assert begun(given, echoes, optics).candidates[0].start == found
+
+
+@pytest.fixture
+def simulated_stage(settings):
+    """Two short stages, the second one corrected by the simulator."""
+    few = settings.simulation.model_copy(update={"rays": 2000})
+
+    def simulate(mesh):
+        return Simulator(Scene(mesh, warns=False), head_of(settings), few)
+
+    last = dataclasses.replace(SHORT[1], beyond="simulate")
+    return {"simulate": simulate, "stages": (SHORT[0], last)}
+
+
+def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same_and_told(
+    bumpy, echoes, optics, simulated_stage, caplog
+):
+    def refuse(mesh):
+        raise InputError("the mesh is 1e-06 m large")
+
+    simulated_stage["simulate"] = refuse
+    fault = "stage 1 goes without the simulator's correction: the mesh is 1e-06 m large"
+    saved = {}
+    for _ in range(2):  # the second time the stages are saved
+        found = refined(bumpy, echoes, optics, saved=saved, **simulated_stage)
+        assert found.kept
+        assert found.faults == [fault]
+    assert fault in caplog.text
+
+
+def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
+    bumpy, echoes, optics, caplog
+):
+    flat = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
+    found = refined({"open": flat, "filled": bumpy}, echoes, optics)
+    assert found.start == "filled"
+    (fault,) = found.faults
+    assert fault.startswith("the start open cannot be compared and counts as the worst: ")
+    assert fault in caplog.text
+
+
+@pytest.mark.parametrize("corrected", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_saved_stages_are_not_repeated_and_the_end_is_the_same(
+    bumpy, echoes, optics, simulated_stage, corrected
+):
+    given = simulated_stage if corrected else {}
+    saved, ends = {}, {}
+    whole = refined(bumpy, echoes, optics, saved=saved, **given)
+    assert list(saved) == ["body-blurred-0", "body-sharp-0", f"body-{whole.history[-1]['way']}-1"]
+    for kept in range(4):  # a kill after each stage
+        some = dict(list(saved.items())[:kept])
+        steps = []
+        ends[kept] = refined(
+            bumpy, echoes, optics, saved=some, after_step=lambda n, _, s=steps: s.append(n), **given
+        )
+        assert steps == [8] * kept + [1] * 8 * (3 - kept)
+        assert ends[kept].history == whole.history
+        assert np.array_equal(ends[kept].mesh.vertices, whole.mesh.vertices)
+        assert np.array_equal(ends[kept].gain, whole.gain)
+
+
+def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
+    bumpy, echoes, optics, settings
+):
+    factor = 3.0
+    old = hearing_of(optics.head)
+    analysis = settings.spectrogram
+    slow = analysis.model_copy(
+        update={
+            "sampling_rate": analysis.sampling_rate / factor,
+            "frequency_min": analysis.frequency_min / factor,
+            "frequency_max": analysis.frequency_max / factor,
+            "range_min": analysis.range_min * factor,
+            "range_max": analysis.range_max * factor,
+        }
+    )
+
+    class Scaled(Head):
+        """The same head, larger by a factor, in air that absorbs nothing."""
+
+        scale = 1.0
+
+        def tables(self, frequency):
+            return dataclasses.replace(
+                old.ears,
+                frequency=old.ears.frequency / self.scale,
+                emitter=old.ears.emitter * self.scale,
+                positions=old.ears.positions * self.scale,
+            )
+
+        def absorption(self, frequency):
+            return np.zeros(len(frequency))
+
+    def optics_at(scale, spectrogram):
+        head = Scaled(ears=settings.ears, analysis=spectrogram)
+        head.__dict__.update(scale=scale, window=np.zeros((1, analysis.window)))
+        synthesis = dataclasses.replace(old.synthesis, nodes=old.synthesis.nodes / scale)
+        return Optics(head, Hearing(head, synthesis))
+
+    def moved(scale, spectrogram):
+        world = changed(
+            echoes,
+            positions=echoes.positions * scale,
+            read=lambda number: echoes.store.read_pose(number) / np.float32(scale),
+        )
+        heard = optics_at(scale, spectrogram)
+        mesh = trimesh.Trimesh(bumpy.vertices * scale, bumpy.faces, process=False)
+        made = module.remesh(mesh, 0.8 * heard.wavelength, 0.3 * heard.wavelength)
+        level = Level(heard.ears, len(heard.frequencies), heard.get_buffer("wavenumber"))
+        work = Descent(
+            made, world, heard, level, smoothing=1.5 * heard.wavelength, rate=0.02, seed=0
+        )
+        for step in range(4):
+            work.step(step, step / 4)
+        return work.vertices / scale
+
+    one, three = moved(1.0, analysis), moved(factor, slow)
+    assert one.shape == three.shape
+    assert float((one - three).abs().max()) < 2e-3 * optics.wavelength
+
+
+def preset(work, objective):
+    """Let the objectives of surfaces be those that a function gives; of starts and others too."""
+    real = work.stage
+
+    def stage(candidate, number):
+        preset.now = candidate, number
+        real(candidate, number)
+
+    def found(mesh, *given, **named):
+        return objective(mesh, *preset.now)
+
+    work.stage, work.comparison.objective = stage, found
+    preset.now = None, 0
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "closed", "chosen"),
+    [
+        (5.2, {"levels", "open"}, "levels"),
+        (5.9, {"levels", "open"}, "open"),
+        (4.5, {"open"}, "open"),  # what no pose can have heard is no body
+        (5.2, {"open"}, "open"),
+        (5.2, set(), "levels"),
+        (2.9, {"open"}, "levels"),  # its error is low
+    ],
+)
+def test_in_doubt_a_closed_candidate_is_chosen_and_levels_before_others(
+    bumpy, error, closed, chosen
+):
+    meshes = {name: bumpy.copy() for name in ("levels", "open")}
+    candidates = [
+        Candidate("sharp", name, None, [bumpy, mesh], [9.0, 5.0 if name == "open" else error])
+        for name, mesh in meshes.items()
+    ]
+    inside = [meshes[name] for name in closed]
+    found = best_of(candidates, lambda mesh: any(mesh is one for one in inside))
+    assert found.start == chosen
+
+
+def test_levels_is_refined_from_the_fuller_surface_too():
+    assert planned({"levels": math.nan, "fuller": math.nan, "open": 5.0, "filled": 4.0}) == [
+        ("levels", "sharp"),
+        ("fuller", "blurred"),
+        ("fuller", "sharp"),
+        ("filled", "blurred"),
+        ("filled", "sharp"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def box():
+    found = trimesh.creation.box((0.03, 0.024, 0.02))
+    return found.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.8, 1.9))
+
+
+@pytest.fixture(scope="module")
+def box_echoes(box, settings, poses, simulated):
+    head, at = head_of(settings), (poses.positions, poses.rotations)
+    found = simulated(box, settings, poses)
+    return echoes_of(head, *at, lambda i: found[i], hull=deaf_hull())
+
+
+@pytest.mark.slow
+def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box_echoes, optics):
+    fine = box.subdivide_to_size(0.6 * optics.wavelength)
+    worn = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(1.02), iterations=3)
+    saved = {}
+    found = refined({"levels": worn}, box_echoes, optics, saved=saved)
+    assert [(one["stage"], one["way"]) for one in found.history] == [
+        (0, "planes"),
+        (0, "sharp"),
+        (1, "planes"),
+    ]
+    del saved["levels-planes-1"]
+    again = refined({"levels": worn}, box_echoes, optics, saved=saved)
+    np.testing.assert_array_equal(found.mesh.vertices, again.mesh.vertices)
+    off = [distance_from(box, np.asarray(m.vertices), 1e-3).mean() for m in (worn, found.mesh)]
+    assert off[1] < 0.5 * off[0]
+    angles = np.sort(found.mesh.face_adjacency_angles)
+    assert np.degrees(angles[-20:]).min() > 80.0
+
+
+@pytest.mark.slow
+def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_echoes, optics):
+    fine = box.subdivide_to_size(0.6 * optics.wavelength)
+    fuller = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=2)
+    levels = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(0.9), iterations=3)
+    starts = {"levels": levels, "fuller": fuller}
+    work = begun(starts, box_echoes, optics)
+    first = work.candidates[0]
+    np.testing.assert_array_equal(first.meshes[0].vertices, fuller.vertices)
+    work.first_stage()
+    assert (first.way, first.start) == ("planes", "levels")
+    np.testing.assert_array_equal(first.meshes[0].vertices, levels.vertices)
+    assert first.objectives[0] == work.compared["levels"]
+
+
+def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
+    work = begun({"levels": bumpy}, echoes, optics)
+    assert [one.way for one in work.candidates] == ["blurred", "sharp"]
+
+
+@pytest.mark.slow
+def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
+    ends = []
+    for starts in ({"body": bumpy}, {"levels": bumpy.copy().apply_scale(1.05), "body": bumpy}):
+        saved = {}
+        begun(starts, echoes, optics, saved=saved).first_stage()
+        ends.append(saved)
+    for way in ("blurred", "sharp"):
+        one, other = (saved[f"body-{way}-0"]["vertices"].numpy() for saved in ends)
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
+    starts = {"body": bumpy, "levels": bumpy.copy()}
+    assert len(refined(starts, echoes, optics).history) == 5
+
+
+@pytest.mark.parametrize(
+    ("objectives", "best"),
+    [
+        ((9.0, 5.0, 5.1, 5.4), 2),  # of equals the later one; a rise is none
+        ((9.0, 5.0, 5.4, 4.0), 3),
+        ((4.0, 5.0, 4.4, 4.3), 3),  # the start is better by chance
+        ((4.0, 5.0, 6.0, 4.7), 0),  # no stage explains as much as the start
+        ((math.inf, 5.0, math.inf), 1),  # what cannot be traced
+        ((math.inf, math.inf), 0),
+        ((4.0,), 0),
+    ],
+)
+def test_the_later_of_equal_surfaces_is_kept(bumpy, objectives, best):
+    candidate = Candidate("sharp", "body", None, [bumpy] * len(objectives), list(objectives))
+    assert candidate.best == best
+
+
+@pytest.mark.parametrize(
+    ("objectives", "best"),
+    [
+        ((9.0, 5.0, 4.8, 4.7), 1),  # the earliest that explains about as much
+        ((9.0, 6.0, 5.0, 4.7), 2),
+        ((5.0, 5.2, 4.8, 4.7), 0),
+        ((5.0, 2.9, 2.85, 2.8), 3),  # it ranks rightly
+    ],
+)
+def test_where_the_error_hardly_ranks_the_earliest_surface_of_levels_is_kept(
+    bumpy, objectives, best
+):
+    candidate = Candidate("sharp", "levels", None, [bumpy] * len(objectives), list(objectives))
+    assert candidate.best == best
+
+
+@pytest.mark.parametrize(("error", "kept"), [(6.0, False), (3.0, True)])
+def test_a_torn_surface_loses_unless_its_error_is_low(bumpy, error, kept):
+    other = bumpy.copy()
+    other.apply_translation([0.1, 0, 0])
+    in_two = trimesh.util.concatenate([bumpy, other])
+    moved = bumpy.copy()
+    moved.apply_scale(2.0)
+    for mesh in (in_two, moved):
+        candidate = Candidate("sharp", "open", None, [bumpy, mesh], [9.0, error], 0.006)
+        assert (candidate.best > 0) == kept
+
+
+def slab(height):
+    """A thin plate, thinner than any voxel of the stages."""
+    plate = trimesh.creation.box((0.02, 0.02, height))
+    return plate.subdivide().subdivide().subdivide().subdivide()
+
+
+def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
+    bumpy, echoes, optics, monkeypatch
+):
+    thin = slab(2e-4)
+    for value, start in ((1.1, "sheet"), (2.0, "body")):
+        starts = {"body": bumpy, "sheet": thin}
+        saved = {}
+        for _ in range(2):  # the second time the stages are saved
+            work = preset(
+                begun(starts, echoes, optics, saved=saved),
+                lambda mesh, one, number, v=value: v if one and one.way == "sheet" else 1.0,
+            )
+            work.first_stage()
+            (candidate,) = work.candidates
+            assert candidate.start == start
+            if start == "sheet":
+                assert all(len(mesh.faces) == len(thin.faces) for mesh in candidate.meshes)
+
+
+def test_a_sheet_alone_is_refined(echoes, optics):
+    found = refined({"sheet": slab(2e-4)}, echoes, optics)
+    assert found.start == "sheet"
+    assert {one["way"] for one in found.history} == {"sheet"}
+
+
+@pytest.fixture(scope="module")
+def too_large():
+    return remesh(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS + 4e-4), 2.5e-3)
+
+
+def descent_on(mesh, echoes, optics):
+    level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+    level.learns = "none"
+    smoothing = 1.5 * optics.wavelength
+    return Descent(mesh, echoes, optics, level, smoothing=smoothing, rate=0.02, seed=0)
+
+
+def off(descent, heard):
+    return float((descent.vertices[heard].norm(dim=1) - RADIUS).abs().mean())
+
+
+def test_a_sphere_that_is_too_large_shrinks_to_what_is_heard(too_large, echoes, optics):
+    work = descent_on(too_large, echoes, optics)
+    heard = poses_that_hear(too_large, echoes, optics) > 0
+    assert 0.05 < float(heard.double().mean()) < 1.0
+    before = off(work, heard)
+    errors = [work.step(number, number / 25) for number in range(25)]
+    assert off(work, heard) < 0.4 * before
+    assert np.mean(errors[-5:]) < 0.7 * np.mean(errors[:3])
+
+
+def test_where_nobody_listens_nothing_moves(too_large, echoes, optics):
+    places = echoes.positions[echoes.training]
+    some = echoes.training[places[:, 2] > 0.1]
+    split = np.full(len(echoes.positions), 1)
+    split[some] = 0
+    upper = changed(echoes, split=split)
+    work = descent_on(too_large, upper, optics)
+    start = work.vertices.clone()
+    for number in range(6):
+        work.step(number, 0.0)
+    moved = ((work.vertices - start) * torch.nn.functional.normalize(start, dim=1)).sum(1).abs()
+    below = start[:, 2] < -0.6 * RADIUS
+    above = start[:, 2] > 0.3 * RADIUS
+    assert float(moved[below].mean()) < 0.35 * float(moved[above].mean())
+
+
+def test_onsets_move_the_surface_to_where_it_must_begin(echoes, optics):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    onsets = OnsetRanges(
+        onsets_of(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS + 1e-3)), 0.006, seed=0
+    )
+    sizes = []
+    for known in (None, onsets):
+        level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+        work = Descent(
+            ball, echoes, optics, level, smoothing=0.004, rate=0.02, onsets=known, seed=0
+        )
+        for number in range(5):
+            work.step(number, 0.0)
+        sizes.append(float(work.vertices.norm(dim=1).mean()))
+    assert sizes[1] > sizes[0] + 5e-5
