@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import signal
 import threading
@@ -22,7 +21,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.tensorboard import SummaryWriter
 
 from sononerf import storage
-from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.errors import NumericalError, StoppedError
 from sononerf.field.datamodule import WholePoses
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule, decibels
@@ -233,7 +232,7 @@ class PreviewCallback(lightning.Callback):
             add_mesh(writer, "mesh/field", self.mesh, trainer.global_step)
 
 
-POSES = 3
+SHOWN_POSES = 3
 """Validation poses that are shown, evenly chosen; always the same ones."""
 
 
@@ -259,7 +258,7 @@ class SpectrogramImages(lightning.Callback):
             return
         was_training = pl_module.training
         pl_module.eval()
-        chosen = np.linspace(0, len(self.poses) - 1, min(POSES, len(self.poses))).astype(int)
+        chosen = np.linspace(0, len(self.poses) - 1, min(SHOWN_POSES, len(self.poses))).astype(int)
         for number in chosen.tolist():
             batch = trainer.strategy.batch_to_device(self.poses[number])
             with torch.inference_mode():
@@ -282,9 +281,9 @@ SCALARS = {
     "val/mae_db_active": "validation_error_dB/active_cells",
 }
 """Name in TensorBoard, with its unit, of each scalar that the module logs."""
-TRIANGLES = 10_000
+MAX_TRIANGLES = 10_000
 """Largest number of triangles of a mesh in TensorBoard, 0.2 MB; larger meshes are decimated."""
-PICTURES = 5
+PICTURE_EPOCHS = 5
 """Epochs between two pictures; those of the last epoch are always drawn."""
 
 
@@ -317,12 +316,12 @@ def writer_of(trainer: lightning.Trainer) -> SummaryWriter | None:
     last = trainer.global_step >= trainer.estimated_stepping_batches
     if not trainer.is_global_zero or not isinstance(logger, TensorBoardLogger):
         return None
-    return logger.experiment if last or epoch % PICTURES == 0 else None
+    return logger.experiment if last or epoch % PICTURE_EPOCHS == 0 else None
 
 
 def add_mesh(writer: SummaryWriter, name: str, mesh: trimesh.Trimesh, step: int) -> None:
     """Show a mesh, m, with few triangles; TensorBoard turns it by mouse."""
-    small = decimated(mesh, TRIANGLES)
+    small = decimated(mesh, MAX_TRIANGLES)
     writer.add_mesh(
         name,
         torch.as_tensor(1e3 * np.asarray(small.vertices), dtype=torch.float32)[None],
@@ -361,19 +360,3 @@ def log_results(run: Path, settings: Mapping[str, Any], metrics: Mapping[str, An
 
 def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
-
-
-def serve(run: Path) -> str:
-    """Serve TensorBoard for a run on 127.0.0.1 until this process ends."""
-    from tensorboard import program
-
-    board = program.TensorBoard()
-    board.configure(
-        argv=[None, "--logdir", str(run / FOLDER), "--host", "127.0.0.1", "--load_fast", "false"]
-    )
-    logging.getLogger("tensorboard").setLevel(logging.ERROR)
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    try:
-        return str(board.launch())
-    except (program.TensorBoardServerException, OSError) as error:
-        raise ResourceError(f"TensorBoard does not start: {error}") from None

@@ -37,7 +37,7 @@ class Picture:
         return self.data
 
 
-class Shown:
+class NotebookRepr:
     """Shows itself in a notebook."""
 
     def _repr_html_(self) -> str:
@@ -75,7 +75,7 @@ def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     header = [cell.strip() for cell in rows[0][1]]
     double = sorted({name for name in header if header.count(name) > 1})
     if double:
-        raise InputError(f"{path}:1: column {double[0]!r} stands twice")
+        raise InputError(f"{path}:1: duplicate column {double[0]!r}")
     for line, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(f"{path}:{line}: {len(row)} columns, expected {len(header)}")

@@ -22,7 +22,7 @@ from rich.progress import Progress as Bars
 
 LINE_SECONDS = 10.0
 """Shortest time between two plain lines, s."""
-WIDE = 80
+MIN_BAR_COLUMNS = 80
 """Least width of a terminal, columns, for a bar with all its numbers in one line."""
 
 
@@ -98,7 +98,7 @@ class Progress:
             task.finish()
             return
         columns: list[ProgressColumn] = [TextColumn("{task.description}"), MofNCompleteColumn()]
-        if self.console.width >= WIDE:
+        if self.console.width >= MIN_BAR_COLUMNS:
             columns[1:1] = [BarColumn()]
             columns += [TimeElapsedColumn(), TimeRemainingColumn()]
             columns += [TextColumn("{task.fields[note]}")]

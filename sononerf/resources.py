@@ -271,7 +271,7 @@ def _without_script() -> Iterator[None]:
             script.update(kept)
 
 
-def reach(scheduler: str) -> None:
+def check_scheduler(scheduler: str) -> None:
     """Connect to a Dask scheduler once, and raise :class:`ResourceError` if it does not answer."""
     with _client(scheduler):
         pass

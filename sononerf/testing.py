@@ -24,7 +24,7 @@ from sononerf.settings import loading
 
 REGION = torch.tensor([[-0.02, -0.02, -0.02], [0.02, 0.02, 0.03]])
 """Box of the tests, m."""
-HEAD = Head(analysis={"frequency_min": 30e3, "frequency_max": 60e3, "range_min": 0.2,
+HEAD = Head(spectrogram={"frequency_min": 30e3, "frequency_max": 60e3, "range_min": 0.2,
                       "range_max": 0.3})  # fmt: skip
 """Head of the tests: its ranges cover the box from poses at a quarter of a metre."""
 POINTS = 50

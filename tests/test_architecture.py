@@ -178,6 +178,25 @@ def writing(tree, file):
                 yield node.lineno
 
 
+EMPTY = {"found", "known", "wanted", "told", "met", "asked"}
+
+
+def empty_names(tree):
+    """Find names that do not say what they hold: arguments, attributes, and what outlives lines."""
+    for node in ast.walk(tree):
+        if getattr(node, "arg", None) in EMPTY or getattr(node, "attr", None) in EMPTY:
+            yield node.lineno
+        elif isinstance(node, ast.ClassDef):
+            fields = [part.target for part in node.body if isinstance(part, ast.AnnAssign)]
+            yield from (field.lineno for field in fields if field.id in EMPTY)
+        elif isinstance(node, ast.FunctionDef):
+            lines = {}
+            for part in ast.walk(node):
+                if isinstance(part, ast.Name) and part.id in EMPTY:
+                    lines.setdefault(part.id, []).append(part.lineno)
+            yield from (min(at) for at in lines.values() if max(at) - min(at) > 3)
+
+
 def faults(path):
     """Return every broken rule of one source file as `file:line: rule`."""
     tree = parse(path)
@@ -192,6 +211,7 @@ def faults(path):
         "not pure": impure_imports(tree, module),
         "chooses a device": device_choices(tree, room),
         "writes past storage": writing(tree, file),
+        "a name without content": empty_names(tree),
     }
     return [f"{name_of(path)}:{line}: {rule}" for rule, lines in found.items() for line in lines]
 
@@ -221,6 +241,9 @@ def test_every_source_keeps_the_rules():
         (device_choices, ("echoes",), "torch.ones(1, device='cpu')", "f(device=x.device)"),
         (device_choices, ("field",), "x.cuda()", "x.cpu()"),
         (device_choices, ("field",), "torch.device(0)", "x.device"),
+        (empty_names, (), "def f(found):\n return 1", "def f(x):\n found = x\n return found"),
+        (empty_names, (), "def f():\n met = 1\n\n\n\n return met", "class A:\n rows: int"),
+        (empty_names, (), "class A:\n known: int", "a.rows = 1"),
         (writing, ("a.py",), "open(p, 'w')", "open(p)"),
         (writing, ("a.py",), "p.open('wb')", "p.open('rb')"),
         (writing, ("a.py",), "open(p, mode='a')", "open('w.txt')"),

@@ -54,7 +54,12 @@ def echoes():
     """Of three places in front of a head without beams: a short tone at the range of each."""
     head = sn.Head(
         ears={"directivity": "omnidirectional", "beam_radius": 0},
-        analysis={"range_min": 0.2, "range_max": 0.3, "frequency_min": 30e3, "frequency_max": 60e3},
+        spectrogram={
+            "range_min": 0.2,
+            "range_max": 0.3,
+            "frequency_min": 30e3,
+            "frequency_max": 60e3,
+        },
     )
     poses = sn.Poses.sphere(60, radius=0.25)
     heard = np.zeros((60, 2, len(head.range), len(head.frequency)))

@@ -370,8 +370,8 @@ def store(tmp_path):
     """A complete store of two poses."""
     made = EnsembleStore.create(
         tmp_path / "store",
-        poses_positions=np.eye(3)[:2],
-        poses_rotations=np.tile(np.eye(3), (2, 1, 1)),
+        positions=np.eye(3)[:2],
+        rotations=np.tile(np.eye(3), (2, 1, 1)),
         split=[0, 1],
         range=[0.3, 0.31, 0.32],
         frequency=[3e4, 4e4],

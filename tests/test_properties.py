@@ -223,7 +223,7 @@ def reconstruction(scale):
     head = sn.Head(
         ears={**places, "directivity": "omnidirectional", "beam_radius": 0},
         air={"relative_humidity": 0.0, "pressure_pa": 200_000.0},
-        analysis={
+        spectrogram={
             "sampling_rate": 1e6 / scale,
             "frequency_min": 40e3 / scale,
             "frequency_max": 80e3 / scale,

@@ -29,7 +29,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("script")
     trimesh.creation.icosphere(subdivisions=3, radius=20.0).export(folder / "ball.stl")
     scene = sn.Scene.load(folder / "ball.stl", unit="mm")
-    head = sn.Head(analysis={"range_min": 0.34, "range_max": 0.45})
+    head = sn.Head(spectrogram={"range_min": 0.34, "range_max": 0.45})
     echoes = sn.simulate(
         scene, sn.Poses.sphere(24, radius=0.4), head, options={"rays": 500, "sources": 60},
         workers=1, progress=QUIET,

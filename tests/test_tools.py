@@ -164,7 +164,7 @@ def test_the_table_shows_starts_candidates_and_result_and_what_a_right_choice_wo
 def test_a_folder_without_a_mesh_is_refused(tmp_path):
     given = argparse.Namespace(foreign=tmp_path, output=tmp_path / "out", calls=[25], set=[])
     with pytest.raises(SystemExit, match=r"holds no mesh \(\.ply"):
-        foreign.foreign(given)
+        foreign.foreign(given, tmp_path / "out")
 
 
 def test_of_each_start_the_surface_with_the_lowest_objective_counts():

@@ -5,6 +5,7 @@
     python tools/benchmark.py exact [--bodies three_spheres balls leaf beaker]
     python tools/benchmark.py surfaces [--only NAME ...] [--seeds 0 1 2] [--exact STORE]
     python tools/benchmark.py surfaces --foreign FOLDER [--calls 400 100 25]
+    python tools/benchmark.py surfaces --page [--output FOLDER]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py errors RUN [RUN ...] [--calibrate]
 
@@ -48,6 +49,7 @@ BODIES = ["three_spheres", "balls", "leaf", "beaker"]
 ONLY_HELP = "rows of the table; all, but exact only with --exact"
 SEEDS_HELP = "of the fits of three_spheres, ua and leaf; of all others the first alone (0 1 2)"
 EXACT_HELP = "ensemble of exact echoes of three_spheres, 100 calls, analysed up to 80 kHz"
+PAGE_HELP = "write docs/results.md and the README's table from the finished runs of --output"
 FOREIGN_HELP = "closed meshes in metres, in place of the rows of the table"
 SET_HELP = "laid over the settings of every run"
 
@@ -78,6 +80,7 @@ def main() -> None:
     command.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=ONLY_HELP)
     command.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help=SEEDS_HELP)
     command.add_argument("--exact", type=Path, metavar="STORE", help=EXACT_HELP)
+    command.add_argument("--page", action="store_true", help=PAGE_HELP)
     command.add_argument("--foreign", type=Path, metavar="FOLDER", help=FOREIGN_HELP)
     command.add_argument(
         "--calls", type=int, nargs="+", default=[400, 100, 25], help="of --foreign"

@@ -17,7 +17,7 @@ import sononerf as sn
 # %%
 head = sn.Head(
     ears={"directivity": "omnidirectional", "beam_radius": 0},
-    analysis={"range_min": 0.2, "range_max": 0.3},
+    spectrogram={"range_min": 0.2, "range_max": 0.3},
 )
 poses = sn.Poses.sphere(80, radius=0.25)
 emitters, receivers = head.places(poses.positions, poses.rotations)

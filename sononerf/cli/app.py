@@ -77,8 +77,8 @@ def optional(values: dict[str, Any], key: str, template: str) -> str:
     return "" if value is None else template.format(value)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(shown: bool) -> None:
+    if shown:
         typer.echo(f"sononerf {__version__}")
         raise typer.Exit
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sononerf.settings.schema import Settings
 
 
-MANY = 64
+MIN_POSES_FOR_WORKERS = 64
 """Number of poses from which worker processes are started at once. Fewer need none."""
 
 
@@ -42,7 +42,11 @@ def _begin(settings: Settings, workers: int | None) -> None:
     """In a terminal, say at once which echoes are wanted; let worker processes import meanwhile."""
     if sys.stderr.isatty():  # elsewhere an error message stays the only line
         say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
-    if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
+    if (
+        settings.data.store is None
+        and settings.poses.count >= MIN_POSES_FOR_WORKERS
+        and workers != 1
+    ):
         from sononerf.resources import begin, preload
 
         preload("sononerf.simulation.ready")
@@ -114,9 +118,6 @@ def fit(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Move an existing run aside first.")
     ] = False,
-    tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Serve TensorBoard on this machine meanwhile.")
-    ] = False,
 ) -> None:
     """Simulate where needed, fit, reconstruct, predict the test poses and evaluate.
 
@@ -132,10 +133,6 @@ def fit(
     from sononerf.run.run import Run as RunOnDisk
 
     folder = output or Path("runs") / _name(settings, config)
-    if tensorboard and not follows():
-        from sononerf.callbacks import serve
-
-        say(f"TensorBoard until the end of this command: {serve(folder)}")
     done = RunOnDisk(folder).fit(
         settings,
         accelerator=accelerator,

@@ -139,23 +139,23 @@ def import_(
         raise SettingsError("--output is missing; name the store, such as --output data/recorded")
     from sononerf.progress import Progress
     from sononerf.run.build import results_folder
-    from sononerf.run.import_recordings import check_before, describe, draw, import_understood
-    from sononerf.run.understand import understand
+    from sononerf.run.import_plan import plan_import
+    from sononerf.run.import_recordings import check_before, describe_plan, draw_plan, write_import
 
-    understood = understand(
+    plan = plan_import(
         form, source, output, settings_file=settings, overrides=overrides or (), progress=Progress()
     )
-    for line in describe(understood):
+    for line in describe_plan(plan):
         say(line)
     if dry_run and preview is None:
         preview = output.with_name(f"{output.name}-preview")
     if preview is not None:
         with results_folder(preview):
-            say(f"wrote {draw(understood, preview)}")
+            say(f"wrote {draw_plan(plan, preview)}")
     if dry_run:
-        verdict = check_before(understood, progress=Progress())
+        verdict = check_before(plan, progress=Progress())
     else:
-        store, verdict = import_understood(understood, output, progress=Progress())
+        store, verdict = write_import(plan, output, progress=Progress())
         say(f"wrote {store.path} ({len(store)} poses)")
     if verdict.message:
         say(f"warning: {verdict.message}")

@@ -16,7 +16,7 @@ from scipy.special import gammainc, gammaincinv
 from sononerf.echoes.memory_ensemble import Ensemble, repeats, seal
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import EXCEEDED
+from sononerf.head.decibels import FALSE_ACTIVE_RATE
 from sononerf.head.head import Head, PointEcho, own_top
 from sononerf.head.row_filters import band_mean
 from sononerf.numerics import Bools, Floats, Ints, Singles
@@ -96,11 +96,11 @@ class RangeLevels:
         loudest one, as if it came from the middle (3,), m. The last is how far a level is below the
         loudest one within ``WINDOW``.
         """
-        ways = np.linalg.norm(self.emitters - middle, axis=1)[:, None] * np.linalg.norm(
+        path_product = np.linalg.norm(self.emitters - middle, axis=1)[:, None] * np.linalg.norm(
             self.receivers - middle, axis=2
         )
         whole = self.level[..., 2]
-        usual = np.median(whole.max(axis=2) + 20 * np.log10(ways))
+        usual = np.median(whole.max(axis=2) + 20 * np.log10(path_product))
         size = 2 * round(WINDOW * self.resolution / self.spacing) + 1
         below = (whole - maximum_filter1d(whole, size, axis=2)).clip(-_OFF, 0)
         return np.concatenate([self.level - np.float32(usual), below[..., None]], axis=3)
@@ -193,15 +193,15 @@ def _is_top(power: Floats) -> Bools:
 def _precursors(power: Floats) -> Floats:
     """Return the level in front of the loudest slice over its own, from one slice on, (L,)."""
     top = power.argmax(axis=1)
-    known = power[np.arange(len(top)), top] > 0.0
-    power, top = power[known], top[known]
+    sounding = power[np.arange(len(top)), top] > 0.0
+    power, top = power[sounding], top[sounding]
     ratios = []
     for lag in range(1, power.shape[1]):
-        reach = np.flatnonzero(top >= lag)
-        if len(reach) * RANK < 1.0:  # too few to be ranked
+        late_enough = np.flatnonzero(top >= lag)
+        if len(late_enough) * RANK < 1.0:  # too few to be ranked
             break
-        at = top[reach]
-        ratios.append(np.quantile(power[reach, at - lag] / power[reach, at], RANK))
+        at = top[late_enough]
+        ratios.append(np.quantile(power[late_enough, at - lag] / power[late_enough, at], RANK))
     return np.asarray(ratios)
 
 
@@ -282,7 +282,7 @@ class Onsets:
         return float(gammainc(np.isfinite(self.first).sum(), FALSE_ALARMS * tries))
 
 
-def asked_poses(store: Ensemble) -> Ints:
+def poses_in_use(store: Ensemble) -> Ints:
     """Return the numbers of the training poses that are analysed, ascending."""
     train = np.asarray(store.indices("train"))
     chosen = np.linspace(0, len(train) - 1, min(MOST_POSES, len(train))).round().astype(int)
@@ -294,7 +294,7 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
 
     In: nearest ((P, E), m).
     """
-    poses = asked_poses(store)
+    poses = poses_in_use(store)
     axis = np.asarray(store.range, dtype=np.float64)
     heard = (np.square(store.read_pose(int(i)), dtype=np.float64) for i in poses)
     if echo.rows is None:
@@ -321,10 +321,10 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
     return Onsets(poses, axis, power, (power > levels.total) & begun, first)
 
 
-BEFORE = 2.0
+NOISE_GAP = 2.0
 """Least distance, range resolutions, between the first echo and the slices in front of it that give
 the noise: the echo's rising flank and nearest sidelobes lie closer."""
-CELLS = 100
+MIN_NOISE_SLICES = 100
 """Least number of slices, over all poses, that give the noise of a receiver."""
 
 
@@ -337,9 +337,9 @@ def noise_rms(store: Ensemble, head: Head) -> Floats | None:
     """
     onsets = find_onsets(store, head.point_echo)
     quiet = (
-        store.range[None, None] < onsets.first[..., None] - BEFORE * head.resolution
+        store.range[None, None] < onsets.first[..., None] - NOISE_GAP * head.resolution
     )  # (P, E, R)
-    if (quiet.sum(axis=(0, 2)) < CELLS).any():
+    if (quiet.sum(axis=(0, 2)) < MIN_NOISE_SLICES).any():
         return None
     heard: list[list[Singles]] = [[] for _ in range(store.receivers)]
     for row, pose in enumerate(onsets.poses.tolist()):
@@ -361,7 +361,7 @@ def heard_again(magnitude: NDArray[np.floating], noise: Floats, seed: int) -> Si
     rng = np.random.default_rng(seed)
     parts = rng.standard_normal((2, *magnitude.shape)) * (noise[:, None] / math.sqrt(2.0))
     drawn = parts[0] + 1j * parts[1]
-    least = noise[:, None] * math.sqrt(math.log(1.0 / EXCEEDED))
+    least = noise[:, None] * math.sqrt(math.log(1.0 / FALSE_ACTIVE_RATE))
     again = np.where(magnitude > least, np.abs(magnitude + math.sqrt(2.0) * drawn), np.abs(drawn))
     return again.astype(np.float32)
 

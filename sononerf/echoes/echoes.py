@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from sononerf import storage
-from sononerf.display import Picture, Shown, picture_of
+from sononerf.display import NotebookRepr, Picture, picture_of
 from sononerf.echoes.detection import (
     Onsets,
     RangeLevels,
-    asked_poses,
     evenly_chosen,
     find_onsets,
+    poses_in_use,
     seal_recorded,
 )
 from sononerf.echoes.free_space import EchoHull, weighted
@@ -41,14 +41,14 @@ if TYPE_CHECKING:  # simulation starts without it
 
 KEPT_BYTES = 400_000_000
 """Size of the spectrograms that stay in memory, bytes; further ones are read at each use."""
-SAME = 1e-6
+SAME_POSE = 1e-6
 """Poses are the same if positions (m) and rotations differ by no more."""
 Split = Literal["train", "val", "test"]
 HELD_BACK = 10
 """Without validation poses, one of this many training poses validates the refinement."""
 
 
-class Echoes(Shown):
+class Echoes(NotebookRepr):
     """The spectrograms of an ensemble of poses, and the head that heard them.
 
     Make them with :func:`sononerf.simulate`, :func:`sononerf.read_recordings`,
@@ -191,8 +191,8 @@ class Echoes(Shown):
         with storage.lock(path):
             written = EnsembleStore.create(
                 path,
-                poses_positions=mine.positions,
-                poses_rotations=mine.rotations,
+                positions=mine.positions,
+                rotations=mine.rotations,
                 split=mine.split,
                 range=mine.range,
                 frequency=mine.frequency,
@@ -246,7 +246,7 @@ class Echoes(Shown):
             for each in (self.poses(), poses)
         )
         distance, number = cKDTree(mine).query(theirs)
-        strange = np.flatnonzero(distance > SAME)
+        strange = np.flatnonzero(distance > SAME_POSE)
         if len(strange):
             raise InputError(
                 f"{self.store.path}: pose {strange[0]} is not among the {len(self)} poses of these "
@@ -297,11 +297,11 @@ class Echoes(Shown):
         """Echoes that are detected at the training poses."""
         nearest = None
         if self.box is not None:
-            poses = asked_poses(self.store)
+            poses = poses_in_use(self.store)
             emitters, ears = self.head.places(self.positions[poses], self.rotations[poses])
             off = (emitters[:, None], ears)
-            ways = [np.linalg.norm(p - p.clip(*self.box), axis=-1) for p in off]
-            nearest = sum(ways) / 2.0 - self.head.resolution
+            distances = [np.linalg.norm(p - p.clip(*self.box), axis=-1) for p in off]
+            nearest = sum(distances) / 2.0 - self.head.resolution
         return find_onsets(self.store, self.head.point_echo, nearest=nearest)
 
     @cached_property
@@ -323,8 +323,8 @@ class Echoes(Shown):
     @cached_property
     def region(self) -> EchoRegion:
         """Places that the echoes leave possible."""
-        turned = self.rotations[self.onsets.poses]
-        return EchoRegion(self.onsets, self.hull, self.head.gains, turned, self.head.resolution)
+        rotations = self.rotations[self.onsets.poses]
+        return EchoRegion(self.onsets, self.hull, self.head.gains, rotations, self.head.resolution)
 
     @cached_property
     def levels(self) -> RangeLevels:

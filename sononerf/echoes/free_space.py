@@ -63,7 +63,7 @@ class EchoHull:
             object.__setattr__(self, "weight", np.isfinite(self.first).astype(np.float64))
 
     @property
-    def trusted(self) -> Floats:
+    def inlier_onsets(self) -> Floats:
         """Range of the first echoes of weight above zero, (P, E) m; else minus infinity."""
         assert self.weight is not None
         return np.where(self.weight > 0.0, self.first, -np.inf)
@@ -104,7 +104,7 @@ class EchoHull:
             np.concatenate([self.emitters, plane.mirrored(self.emitters)]),
             np.concatenate([self.receivers, plane.mirrored(self.receivers)]),
             np.concatenate([self.first, self.first]),
-            np.concatenate([self.axes, self.axes @ plane.turn]),
+            np.concatenate([self.axes, self.axes @ plane.reflection]),
             self.within,
             None if self.weight is None else np.concatenate([self.weight, self.weight]),
         )
@@ -133,7 +133,7 @@ class EchoHull:
     def _onsets(self) -> tuple[Floats, Floats, Floats, Floats, float]:
         """Arrays of the onsets: arguments of :func:`_behind`."""
         looks = np.broadcast_to(self.axes, self.emitters.shape)
-        parts = (self.emitters, self.receivers, self.trusted, looks)
+        parts = (self.emitters, self.receivers, self.inlier_onsets, looks)
         emitters, receivers, first, axes = (np.array(part, dtype=np.float64) for part in parts)
         return emitters, receivers, first, axes, float(self.within)
 
@@ -197,7 +197,7 @@ def _possible(
     chosen: Bools,
     few: int,
     share: float,
-    reach: float,
+    tolerance: float,
 ) -> Bools:
     """Return the cells (N,) that few onsets rule out and that lie at the range of a wanted one.
 
@@ -213,9 +213,9 @@ def _possible(
             for ear in range(first.shape[1]):
                 back = _distance(cells[n], receivers[pose, ear])
                 behind = 0.5 * (out + back) - first[pose, ear]
-                if behind < -reach:
+                if behind < -tolerance:
                     against += 1
-                elif behind <= reach:
+                elif behind <= tolerance:
                     agree += 1
                     meets = meets or chosen[pose, ear]
         is_possible[n] = meets and against <= max(few, share * agree)
@@ -259,13 +259,13 @@ def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) ->
         return hull
     error = ACCURACY * resolution
     for scale in 2.0 ** -np.arange(LEVELS):  # gross outliers first
-        reach = error * scale * 2.0 ** (LEVELS - 1)
+        tolerance = error * scale * 2.0 ** (LEVELS - 1)
         weight = np.array(hull.weight).reshape(-1)
         heard = np.flatnonzero(weight)
-        homeless = heard[~_cells(hull, box, heard, 0, 0.0, error, reach)[1].any(axis=0)]
+        homeless = heard[~_cells(hull, box, heard, 0, 0.0, error, tolerance)[1].any(axis=0)]
         if len(homeless):
             few = max(int(UNDETECTED * scale * len(heard)), 4 * ears)
-            against, meets = _cells(hull, box, homeless, few, SHARE, error, reach)
+            against, meets = _cells(hull, box, homeless, few, SHARE, error, tolerance)
             _remove(weight, homeless, against, meets, float(ears))
             hull = replace(hull, weight=weight.reshape(hull.first.shape))
     return hull
@@ -299,7 +299,7 @@ def _remove(
 
 def _heard_box(hull: EchoHull) -> Floats | None:
     """Return a box around where each first echo comes from if it lies ahead, (2, 3) m."""
-    first = hull.trusted.max(axis=1)
+    first = hull.inlier_onsets.max(axis=1)
     has_onset = np.isfinite(first)
     if not has_onset.any():
         return None
@@ -330,22 +330,22 @@ def _cells(
     side = float((upper - lower).max()) / COARSE
     axes = [np.arange(a + side / 2, b + side / 2, side) for a, b in zip(lower, upper, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    is_wanted = np.zeros(hull.first.size, dtype=np.bool_)
-    is_wanted[chosen] = True
+    is_chosen = np.zeros(hull.first.size, dtype=np.bool_)
+    is_chosen[chosen] = True
     while True:
-        reach = float(side * np.sqrt(3) / 2 + error)
-        of_wanted = is_wanted.reshape(hull.first.shape)
+        tolerance = float(side * np.sqrt(3) / 2 + error)
+        of_chosen = is_chosen.reshape(hull.first.shape)
         if hull.plane is not None:
-            cells = cells[hull.plane.height(cells) > -reach]
-        cells = cells[_possible(cells, *hull._onsets, of_wanted, few, share, reach)]
+            cells = cells[hull.plane.height(cells) > -tolerance]
+        cells = cells[_possible(cells, *hull._onsets, of_chosen, few, share, tolerance)]
         finer = 8.0 * len(cells) * hull.first.size
-        if reach <= least + error or finer > MOST_PAIRS or not len(cells):
+        if tolerance <= least + error or finer > MOST_PAIRS or not len(cells):
             break
         cells = (cells[:, None] + side * OCTANTS).reshape(-1, 3)
         side /= 2
     against, meets = [], []
     for start in range(0, max(len(cells), 1), hull.chunk):
         behind = hull.behind(cells[start : start + hull.chunk]).reshape(-1, hull.first.size)
-        against.append(behind < -reach)
-        meets.append(np.abs(behind[:, chosen]) <= reach)
+        against.append(behind < -tolerance)
+        meets.append(np.abs(behind[:, chosen]) <= tolerance)
     return np.concatenate(against), np.concatenate(meets)

@@ -31,7 +31,7 @@ AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
     "frequency": ("float64", ("frequency",), ()),
 }
 RESERVED = ("format", "schema_version")
-SAME_PLACE, SAME_TURN = 1e-6, 1e-6  # m and no unit: of one pose, printed twice
+SAME_PLACE, SAME_ROTATION = 1e-6, 1e-6  # m and no unit: of one pose, printed twice
 
 
 def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
@@ -67,7 +67,7 @@ def pose_groups(poses: Poses) -> Ints:
     table = np.concatenate(
         [
             np.round(poses.positions / SAME_PLACE),
-            np.round(poses.rotations.reshape(len(poses), 9) / SAME_TURN),
+            np.round(poses.rotations.reshape(len(poses), 9) / SAME_ROTATION),
         ],
         axis=1,
     )
@@ -215,7 +215,7 @@ class Ensemble(ABC):
                 f"{self.path}: pose {index} has shape {values.shape}, "
                 f"expected (receivers, ranges, frequencies) {shape}"
             )
-        fault = fault_of(values)
+        fault = spectrogram_fault(values)
         if fault:
             raise NumericalError(f"{self.path}: pose {index} holds {fault}")
         return values
@@ -225,13 +225,13 @@ class Ensemble(ABC):
             raise InputError(f"{self.path}: no pose {index}; there are 0 to {len(self) - 1}")
 
 
-LOUDEST = 1e18
+MAX_MAGNITUDE = 1e18
 """Largest magnitude of a spectrogram: the square of a larger one overflows single precision."""
 
 
-def fault_of(spectrogram: Singles) -> str:
+def spectrogram_fault(spectrogram: Singles) -> str:
     """Return where a spectrogram (E, R, F) holds invalid magnitudes; empty if nowhere."""
-    usable = (spectrogram >= 0.0) & (spectrogram <= LOUDEST)  # False for NaN
+    usable = (spectrogram >= 0.0) & (spectrogram <= MAX_MAGNITUDE)  # False for NaN
     if usable.all():
         return ""
     at = np.unravel_index(int(usable.argmin()), usable.shape)

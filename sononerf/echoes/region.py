@@ -28,14 +28,14 @@ NOTHING = (
     "set region.lower and region.upper"
 )
 NOISE = (
-    "no pose received an echo: an onset at {found} of {of} ears is no more than noise alone gives; "
+    "no pose received an echo: an onset at {count} of {of} ears is no more than noise alone gives; "
     "call louder or from nearer, or check scene, poses, range limits and noise"
 )
 
 # Sizes of the search: poses that give power, passes from coarse to fine, cells along the
 # longest side in each of them, passes over the power, and places that are processed at once.
 POSES, LOOKS, COARSE, ROUNDS, CHUNK = 200, 4, 28, 4, 2048
-ENOUGH = 2  # poses: an echo of one pose alone may come from any place of an ellipsoid
+MIN_POSES = 2  # poses: an echo of one pose alone may come from any place of an ellipsoid
 
 
 class EchoRegion:
@@ -47,11 +47,11 @@ class EchoRegion:
     def __init__(
         self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Floats, resolution: float
     ) -> None:
-        if not np.isfinite(hull.trusted).any():
+        if not np.isfinite(hull.inlier_onsets).any():
             raise NumericalError(NOTHING)
         if heard.chance(resolution) > FALSE_ALARMS:
-            found, of = int(np.isfinite(heard.first).sum()), heard.first.size
-            raise NumericalError(NOISE.format(found=found, of=of))
+            count, of = int(np.isfinite(heard.first).sum()), heard.first.size
+            raise NumericalError(NOISE.format(count=count, of=of))
         self.hull, self.resolution, self.range = hull, resolution, heard.range
         self.step = float(heard.range[1] - heard.range[0])
         count = len(heard.poses)
@@ -59,7 +59,7 @@ class EchoRegion:
         self.heard = heard.heard[sampled].any(axis=1)  # (P, R)
         total = heard.power[sampled].sum(axis=1) * self.heard
         self.power = total / total.sum(axis=1, keepdims=True).clip(1e-300)
-        self.first = hull.trusted[sampled].max(axis=1)
+        self.first = hull.inlier_onsets[sampled].max(axis=1)
         self.sources, self.rotations = hull.sources[sampled], rotations[sampled]
         gain = (ears.beam[None] * ears.ears).max(axis=(0, 1))  # (L, A)
         self.witness_gain = gain >= WITNESS_GAIN * gain.max()
@@ -91,7 +91,7 @@ class EchoRegion:
             meets = witness & within
             sounding.append((meets & heard[pose, row]).sum(axis=0))
             energy.append((meets * loud[pose, row]).sum(axis=0) / witness.sum(axis=0).clip(1))
-        return np.concatenate(energy), np.concatenate(sounding) >= ENOUGH
+        return np.concatenate(energy), np.concatenate(sounding) >= MIN_POSES
 
     def _rows(self, points: Floats) -> tuple[Floats, Ints, Bools]:
         """Return each pose's distance to each place, and the slice it falls in, (P, N)."""
@@ -171,10 +171,10 @@ class EchoRegion:
         pose = np.arange(len(row))
         while True:
             asks = np.flatnonzero(has_onset & ~covered[pose, row])
-            if len(asks) <= max(ENOUGH, UNEXPLAINED * has_onset.sum()):
+            if len(asks) <= max(MIN_POSES, UNEXPLAINED * has_onset.sum()):
                 return keep
             agree = np.where(inside & ~keep, self._shared(points, tolerance, asks), 0)
-            if agree.max() <= ENOUGH:
+            if agree.max() <= MIN_POSES:
                 return keep
             keep = keep | (agree >= AGREEMENT * agree.max())
             covered = self._covered(points[keep], tolerance)
@@ -196,12 +196,12 @@ class EchoRegion:
             _, row, within = self._rows(points[start : start + CHUNK])
             pose = np.broadcast_to(np.arange(len(row))[:, None], row.shape)
             covered[pose[within], row[within]] = True
-        reach = int(np.ceil((tolerance + self.resolution) / self.step))
-        covered = ndimage.maximum_filter1d(covered, 2 * reach + 1, axis=1, mode="constant")
+        half_width = int(np.ceil((tolerance + self.resolution) / self.step))
+        covered = ndimage.maximum_filter1d(covered, 2 * half_width + 1, axis=1, mode="constant")
         return np.asarray(covered)
 
 
-FEW = 0.02
+MIN_POSE_FRACTION = 0.02
 """Fraction of the poses that must hear an echo at a range or beyond it for it to count, no unit."""
 
 
@@ -217,5 +217,5 @@ def echo_extent(power: Floats, axis: Floats, looks: float, margin: float) -> tup
         return float(axis[0]), float(axis[-1])
     first = axis[heard[some].argmax(axis=1)]
     last = axis[heard.shape[1] - 1 - heard[some, ::-1].argmax(axis=1)]
-    low, high = np.quantile(first, FEW), np.quantile(last, 1.0 - FEW)
+    low, high = np.quantile(first, MIN_POSE_FRACTION), np.quantile(last, 1.0 - MIN_POSE_FRACTION)
     return max(float(low - margin), float(axis[0])), min(float(high + margin), float(axis[-1]))

@@ -20,8 +20,8 @@ from sononerf.echoes.memory_ensemble import (
     RESERVED,
     Ensemble,
     checked_axes,
-    fault_of,
     plain_attributes,
+    spectrogram_fault,
 )
 from sononerf.errors import IncompatibleError, InputError, NumericalError
 from sononerf.numerics import Singles
@@ -32,7 +32,7 @@ CRC_BYTES = 4
 UNITS = {"position": "m", "range": "m", "frequency": "Hz"}
 """Units of the arrays; arrays without one are plain numbers."""
 
-ANEW = "fetch the store again, or move its folder away and simulate or import it anew"
+FETCH_ANEW = "fetch the store again, or move its folder away and simulate or import it anew"
 """Advice about damage that writing single poses again does not mend."""
 
 
@@ -160,11 +160,13 @@ def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
         size = chunk.stat().st_size if chunk.is_file() else 0
         # This also bounds the memory: a declared size without a file of that size is refused.
         if size != array.nbytes + CRC_BYTES:
-            raise InputError(f"{chunk}: {size} bytes, expected {array.nbytes + CRC_BYTES}; {ANEW}")
+            raise InputError(
+                f"{chunk}: {size} bytes, expected {array.nbytes + CRC_BYTES}; {FETCH_ANEW}"
+            )
         try:
             axes[name] = np.asarray(array[...])
         except Exception as error:  # zarr's codecs raise their own kinds
-            raise InputError(f"{chunk}: damaged ({error}); {ANEW}") from error
+            raise InputError(f"{chunk}: damaged ({error}); {FETCH_ANEW}") from error
     poses = {len(axes[name]) for name in ("position", "rotation", "split")}
     if len(poses) > 1:
         raise InputError(f"{root}: position, rotation and split differ in length: {sorted(poses)}")
@@ -242,8 +244,8 @@ class EnsembleStore(Ensemble):
         cls,
         path: Path,
         *,
-        poses_positions: ArrayLike,
-        poses_rotations: ArrayLike,
+        positions: ArrayLike,
+        rotations: ArrayLike,
         split: ArrayLike,
         range: ArrayLike,  # noqa: A002 - the axis is called so
         frequency: ArrayLike,
@@ -254,15 +256,11 @@ class EnsembleStore(Ensemble):
 
         The group's own file comes last, so that an unfinished store is not taken for one.
 
-        In: poses_positions ((P, 3), m), poses_rotations (P, 3, 3), split (P,), range ((R,), m),
+        In: positions ((P, 3), m), rotations (P, 3, 3), split (P,), range ((R,), m),
         frequency ((F,), Hz).
         """
         axes = checked_axes(
-            position=poses_positions,
-            rotation=poses_rotations,
-            split=split,
-            range=range,
-            frequency=frequency,
+            position=positions, rotation=rotations, split=split, range=range, frequency=frequency
         )
         plain = plain_attributes(path, attributes)
         if not (path / "zarr.json").exists():
@@ -318,7 +316,7 @@ class EnsembleStore(Ensemble):
             raise InputError(
                 f"{self.path}: pose {index} is damaged ({error}); {way_out}"
             ) from error
-        fault = fault_of(values)
+        fault = spectrogram_fault(values)
         if fault:
             raise InputError(
                 f"{self.path}: pose {index} holds {fault}; whoever wrote the store has to mend it"

@@ -122,8 +122,8 @@ def _spread(
         for j in range(total.shape[1]):
             out, back = x_out[i] + y_out[j], x_back[i] + y_back[j]
             for k in range(total.shape[2]):
-                way = math.sqrt(out + z_out[k]) + math.sqrt(back + z_back[k])
-                place = min(max(scale * way - start / step + 1.0, 0.0), last)
+                path = math.sqrt(out + z_out[k]) + math.sqrt(back + z_back[k])
+                place = min(max(scale * path - start / step + 1.0, 0.0), last)
                 index = int(place)
                 low = profile[index]
                 total[i, j, k] += low + (place - index) * (profile[index + 1] - low)
@@ -207,9 +207,9 @@ def voxel_fit(
     window = np.square(head.window).mean(axis=0)
     kernel = _kernel(window, head.speed_of_sound / head.sampling_rate / 2, step, spacing)
     energies = np.array(list(range_profiles(spectrograms, (*receivers.shape[:2], len(axis)))))
-    reach = len(kernel) // 2
-    bins = len(axis) + 2 * reach
-    first = axis[0] - reach * step
+    half_width = len(kernel) // 2
+    bins = len(axis) + 2 * half_width
+    first = axis[0] - half_width * step
     with np.errstate(divide="ignore"):
         spread = np.maximum(first + step * np.arange(bins), 0.0) ** -4.0
     spread[~np.isfinite(spread)] = 0.0
@@ -237,8 +237,8 @@ def _kernel(values: Floats, window_step: float, step: float, depth: float) -> Fl
     """Return the response of the slices around a voxel: the window, over the voxel's depth."""
     half = (len(values) - 1) / 2
     # So far that even the nearest part of a voxel's depth lies beyond the window: zero at the ends.
-    reach = int(np.ceil((half * window_step + depth / 2) / step))
-    slices = step * np.arange(-reach, reach + 1)
+    half_width = int(np.ceil((half * window_step + depth / 2) / step))
+    slices = step * np.arange(-half_width, half_width + 1)
     shifts = depth * ((np.arange(DEPTH_STEPS) + 0.5) / DEPTH_STEPS - 0.5)
     place = (slices[:, None] + shifts) / window_step + half
     return np.interp(place, np.arange(len(values)), values, left=0.0, right=0.0).mean(axis=1)
@@ -277,8 +277,8 @@ def _sorted(
         for j in range(power.shape[1]):
             out, back = x_out[i] + y_out[j], x_back[i] + y_back[j]
             for k in range(power.shape[2]):
-                way = math.sqrt(out + z_out[k]) + math.sqrt(back + z_back[k])
-                place = min(max(int(0.5 / step * way - first / step + 0.5), 0), bins - 1)
+                path = math.sqrt(out + z_out[k]) + math.sqrt(back + z_back[k])
+                place = min(max(int(0.5 / step * path - first / step + 0.5), 0), bins - 1)
                 index[i, j, k] = place
                 total[place] += power[i, j, k]
     return total

@@ -179,7 +179,7 @@ def _trimesh(solid: Manifold) -> trimesh.Trimesh:
 # Triangles per box of the locator; more are slower far from the surface, fewer near it.
 TRIANGLES_PER_BOX = 8
 # So much farther than a corner is looked, against rounding; of the distance and of the mesh's size.
-SLACK = 1e-9
+ROUNDING_SLACK = 1e-9
 
 
 class Nearest:
@@ -243,7 +243,7 @@ class Nearest:
         squared: Any = reference(0.0)
         find = self._locator.FindClosestPointWithinRadius
         size = float(np.abs(self.corners.data).max())
-        radii = (bound * (1 + SLACK) + SLACK * size).tolist()
+        radii = (bound * (1 + ROUNDING_SLACK) + ROUNDING_SLACK * size).tolist()
         rows = points.tolist()
         distances = np.full(len(points), np.inf)
         for index in order.tolist():
@@ -277,10 +277,10 @@ def geometry_metrics(
     points, face = sample_surface(reconstructed, samples, seed + 1)
     normals = np.asarray(reconstructed.face_normals)[face]
     to_truth = true.nearest.distance(points)
-    to_found = Nearest(reconstructed).distance(true_points)
+    to_mesh = Nearest(reconstructed).distance(true_points)
     return {
-        "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
-        "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
+        "chamfer_m": float(to_truth.mean() + to_mesh.mean()) / 2,
+        "fscore": {f"{limit:g}": _fscore(to_truth, to_mesh, limit) for limit in thresholds},
         "thickness_bias_m": _thickness_bias(true, points, to_truth),
         **_volume_metrics(solid, true),
         "normal_consistency": _normal_consistency(points, normals, true_points, true_normals),
@@ -319,16 +319,16 @@ def target_metrics(
     kept = true.nearest.distance(middles) <= around.distance(middles)
     kept[face[counts]] = True
     part = trimesh.Trimesh(reconstructed.vertices, reconstructed.faces[kept], process=False)
-    to_found = Nearest(part).distance(true.samples(samples, seed)[0])
+    to_mesh = Nearest(part).distance(true.samples(samples, seed)[0])
     return {
         **metrics,
-        "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
-        "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
+        "chamfer_m": float(to_truth.mean() + to_mesh.mean()) / 2,
+        "fscore": {f"{limit:g}": _fscore(to_truth, to_mesh, limit) for limit in thresholds},
     }
 
 
-def _fscore(to_truth: Floats, to_found: Floats, limit: float) -> float:
-    precision, recall = float((to_truth <= limit).mean()), float((to_found <= limit).mean())
+def _fscore(to_truth: Floats, to_mesh: Floats, limit: float) -> float:
+    precision, recall = (float((to_truth <= limit).mean()), float((to_mesh <= limit).mean()))
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 

@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from trimesh.registration import procrustes
 
-from sononerf.display import Shown
+from sononerf.display import NotebookRepr
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation.baseline import BASELINES, best_level_surface, volume_of
@@ -26,20 +26,20 @@ from sononerf.resources import computed
 from sononerf.scene.scene import Scene
 from sononerf.start.surface import Surface
 
-MANY = 64
+MIN_POSES_FOR_PROCESS = 64
 """Number of training poses from which a process of its own saves time."""
 
-Kind = Literal["none", "rigid", "similarity"]
+RegistrationKind = Literal["none", "rigid", "similarity"]
 
-COARSE = 500
+COARSE_SAMPLES = 500
 """Samples of each surface while all starts are compared."""
-FINE = 10_000
+FINE_SAMPLES = 10_000
 """Samples of each surface for the best starts."""
-BEST = 3
+REFINED_STARTS = 3
 """Number of starts that are refined with all samples."""
-STEPS = 100
+MAX_ITERATIONS = 100
 """Most iterations from one start; most end after 20 to 50."""
-SETTLED = 1e-5
+CONVERGED = 1e-5
 """Relative change of the mean distance at which the iteration ends."""
 
 
@@ -64,7 +64,7 @@ class Registration:
 
 
 def register(
-    reconstructed: trimesh.Trimesh, truth: trimesh.Trimesh, kind: Kind, *, seed: int = 0
+    reconstructed: trimesh.Trimesh, truth: trimesh.Trimesh, kind: RegistrationKind, *, seed: int = 0
 ) -> Registration:
     """Find the motion that lays one surface over another, by iterated closest points [1]_.
 
@@ -80,16 +80,16 @@ def register(
         return Registration(np.eye(4), 1.0)
     scaled = kind == "similarity"
     points, target = (
-        np.asarray(trimesh.sample.sample_surface(mesh, FINE, seed=seed)[0])
+        np.asarray(trimesh.sample.sample_surface(mesh, FINE_SAMPLES, seed=seed)[0])
         for mesh in (reconstructed, truth)
     )
     tried = [
-        _closest(points[:COARSE], target[:COARSE], start, scaled)
+        _closest(points[:COARSE_SAMPLES], target[:COARSE_SAMPLES], start, scaled)
         for start in _starts(points, target, scaled)
     ]
     tried.sort(key=lambda pair: pair[0])
     best = min(
-        (_closest(points, target, start, scaled) for _, start in tried[:BEST]),
+        (_closest(points, target, start, scaled) for _, start in tried[:REFINED_STARTS]),
         key=lambda pair: pair[0],
     )
     return Registration(best[1], float(np.cbrt(np.linalg.det(best[1][:3, :3]))))
@@ -108,14 +108,14 @@ def _starts(points: Floats, target: Floats, scaled: bool) -> list[Floats]:
     turns = [np.eye(3)]
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
-            turn = axes[1].T @ (np.array(signs)[:, None] * axes[0][list(order)])
-            if np.linalg.det(turn) > 0:
-                turns.append(turn)
+            rotation = axes[1].T @ (np.array(signs)[:, None] * axes[0][list(order)])
+            if np.linalg.det(rotation) > 0:
+                turns.append(rotation)
     starts = [] if scaled else [np.eye(4)]
-    for turn in turns:
+    for rotation in turns:
         start = np.eye(4)
-        start[:3, :3] = scale * turn
-        start[:3, 3] = middles[1] - scale * turn @ middles[0]
+        start[:3, :3] = scale * rotation
+        start[:3, 3] = middles[1] - scale * rotation @ middles[0]
         starts.append(start)
     return starts
 
@@ -123,12 +123,12 @@ def _starts(points: Floats, target: Floats, scaled: bool) -> list[Floats]:
 def _closest(points: Floats, target: Floats, start: Floats, scaled: bool) -> tuple[float, Floats]:
     """Iterate from a start; return the mean distance, m, and the motion."""
     tree, motion, before = cKDTree(target), start, np.inf
-    for _ in range(STEPS):
+    for _ in range(MAX_ITERATIONS):
         moved = trimesh.transform_points(points, motion)
         out, near = tree.query(moved)
         back, origin = cKDTree(moved).query(target)
         error = 0.5 * float(out.mean() + back.mean())
-        if error > (1.0 - SETTLED) * before:
+        if error > (1.0 - CONVERGED) * before:
             break
         before = error
         pairs = np.concatenate([points, points[origin]]), np.concatenate([target[near], target])
@@ -142,7 +142,7 @@ gives 39."""
 
 
 def check_truth(
-    reconstructed: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str
+    reconstructed: trimesh.Trimesh, true: trimesh.Trimesh, kind: RegistrationKind, name: str
 ) -> None:
     """Refuse a true surface that is of another size, or elsewhere, before any work."""
     sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (reconstructed, true)]
@@ -185,9 +185,11 @@ BASELINE_SAMPLES = 20_000
 class Truth:
     """A true surface, laid over a reconstruction."""
 
-    def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:
+    def __init__(
+        self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: RegistrationKind
+    ) -> None:
         self.surface = Solid(true)
-        self.kind: Kind = kind
+        self.kind: RegistrationKind = kind
         self.motion: Registration = register(mesh, true, kind)
         self.mesh = self.motion.of(mesh)
         # The truth in the frame of the reconstruction, in which levels of baselines are chosen.
@@ -231,14 +233,14 @@ def baseline_volume(name: str, echoes: Echoes, lower: Floats, upper: Floats) -> 
     spacing = float((upper - lower).max()) / BASELINE_VOXELS
     poses = Poses(echoes.positions[train], echoes.rotations[train])
     task = name, train, poses, echoes.head, lower, upper, spacing
-    if len(train) < MANY:
+    if len(train) < MIN_POSES_FOR_PROCESS:
         return volume_of(echoes.store, *task)
     ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, what="baseline")
     assert isinstance(volume, Volume)
     return volume
 
 
-SAME = 1e-6
+SAME_CENTROID = 1e-6
 """Largest distance between the centroids of two triangles that count as the same, m."""
 
 
@@ -293,7 +295,7 @@ def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trime
     if not len(without.faces):
         return mesh
     distance, _ = cKDTree(without.triangles_center).query(mesh.triangles_center)
-    added = np.flatnonzero(distance > SAME)
+    added = np.flatnonzero(distance > SAME_CENTROID)
     return mesh.submesh([added], append=True) if len(added) else None
 
 
@@ -301,7 +303,7 @@ UNITS = {"m": (1e3, "mm"), "db": (1.0, "dB"), "s": (1.0, "s")}
 """How numbers are shown, by a part of their name after the first: factor and unit."""
 
 
-class Evaluation(dict[str, Any], Shown):
+class Evaluation(dict[str, Any], NotebookRepr):
     """Numbers by name, as the README explains them; ``print`` shows them with their units."""
 
     def rows(self) -> list[tuple[str, str]]:
@@ -337,7 +339,7 @@ def evaluate(
     truth: Scene | trimesh.Trimesh,
     echoes: Echoes | None = None,
     *,
-    registration: Kind = "none",
+    registration: RegistrationKind = "none",
     progress: Progress | None = None,
 ) -> Evaluation:
     """Compare a surface with the true one, and with the baselines.

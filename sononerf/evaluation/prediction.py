@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.display import Shown
+from sononerf.display import NotebookRepr
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, expect
 from sononerf.evaluation.traced import Traced, covered, interval_db, learn_traced, mix, trace_poses
@@ -41,7 +41,7 @@ SSIM_WINDOW = 11
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction(Shown):
+class Prediction(NotebookRepr):
     """Predicted spectrograms of poses, (P, E, R, F) linear magnitude.
 
     Attributes:

@@ -32,14 +32,14 @@ from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
 
-COVERED = 0.9
+COVERED_FRACTION = 0.9
 """Fraction of the active cells that an interval holds."""
 STEP_DB = 6.0
 """Width of a class of predicted levels, dB: a factor of two in magnitude."""
 CLASSES = round(RANGE_DB / STEP_DB)
 BANDS = 6
 """Number of classes of frequency: with ten poses each class holds some hundred cells."""
-FEWEST = 50
+MIN_CLASS_CELLS = 50
 """Number of active cells below which a class takes the quantile of its level at all frequencies."""
 
 
@@ -62,7 +62,7 @@ def learn_interval(
         usual = _quantile(error[some])
         for band in np.array_split(np.arange(count), min(BANDS, count)):
             found = error[..., band][some[..., band]]
-            half[one, band] = usual if len(found) < FEWEST else _quantile(found)
+            half[one, band] = usual if len(found) < MIN_CLASS_CELLS else _quantile(found)
     for one in range(CLASSES) if classes else ():  # others are as uncertain as the next lower one
         half[one] = half[max((other for other in classes if other <= one), default=classes[0])]
     return half
@@ -83,8 +83,8 @@ def level_class(predicted_db: ArrayLike) -> Ints:
 
 
 def _quantile(errors: Floats) -> float:
-    """Return the error that a new one exceeds with a probability of 1 - ``COVERED`` at most."""
-    rank = min(math.ceil((len(errors) + 1) * COVERED), len(errors))
+    """Return the error that a new one exceeds at most in one minus ``COVERED_FRACTION``."""
+    rank = min(math.ceil((len(errors) + 1) * COVERED_FRACTION), len(errors))
     return float(np.partition(errors, rank - 1)[rank - 1])
 
 

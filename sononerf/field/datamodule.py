@@ -92,13 +92,13 @@ class SliceStream(Dataset[RangeSlices]):
         self.frequencies = len(store.frequency)
         self.axis = store.range
         self.whole_poses = whole_poses
-        self.met: Tensor | None = None  # which slices, where not all
+        self.used_slices: Tensor | None = None  # which slices, where not all
         if silent_share < 1.0:
             if whole_poses:
                 raise ValueError("whole poses are met with their silence")
-            self.met = self._met(silent_share, silent_below, seed)
+            self.used_slices = self._used_slices(silent_share, silent_below, seed)
         every = len(self.poses) if whole_poses else len(self.poses) * self.ranges
-        self.items = every if self.met is None else len(self.met)
+        self.items = every if self.used_slices is None else len(self.used_slices)
         self.batch = min(batch, self.items)
         if self.batch < share[1]:
             raise SettingsError(
@@ -115,7 +115,7 @@ class SliceStream(Dataset[RangeSlices]):
         """Steps in which every pose or slice is met once."""
         return -(-self.items // self.batch)
 
-    def _met(self, silent_share: float, silent_below: float, seed: int) -> Tensor:
+    def _used_slices(self, silent_share: float, silent_below: float, seed: int) -> Tensor:
         """Return the slices that sound and some of those that do not, ascending."""
         poses = self.poses.tolist()
         silent = torch.cat([_silent(self.reader[pose], silent_below) for pose in poses])
@@ -132,7 +132,7 @@ class SliceStream(Dataset[RangeSlices]):
         # The last batch of a pass is filled up from its beginning, so all have one size.
         index = torch.arange(part * self.batch, (part + 1) * self.batch) % self.items
         items = self._order[1][index][self.share[0] :: self.share[1]]
-        return items if self.met is None else self.met[items]
+        return items if self.used_slices is None else self.used_slices[items]
 
     def __getitem__(self, step: int) -> RangeSlices:
         """Return batch ``step``."""

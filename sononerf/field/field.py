@@ -68,11 +68,11 @@ class Field(nn.Module):
         index = ((places - self.region[0]) / cell).round().long()
         index = index.clamp_min(0).minimum(size - 1)
         near[index[:, 0], index[:, 1], index[:, 2]] = 1.0
-        reach = math.ceil(spacing / cell / 2 - 1e-6) if spacing > 1.001 * cell else 0
+        half_width = math.ceil(spacing / cell / 2 - 1e-6) if spacing > 1.001 * cell else 0
         # One axis after the other: a cube at once would take reach² times as long.
         for axis in range(3):
-            size_of = [2 * reach + 1 if axis == a else 1 for a in range(3)]
-            edge = [reach if axis == a else 0 for a in range(3)]
+            size_of = [2 * half_width + 1 if axis == a else 1 for a in range(3)]
+            edge = [half_width if axis == a else 0 for a in range(3)]
             near = max_pool3d(near[None, None], size_of, 1, edge)[0, 0]
         self.occupancy = near > 0
         self.cell = torch.full_like(self.cell, cell)

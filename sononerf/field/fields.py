@@ -138,7 +138,7 @@ class FourierField(Field):
         return result.index_put((inside,), response)
 
 
-SLIGHT = 1e-5
+MIN_VERTEX_WEIGHT = 1e-5
 """Weight below which a vertex of the grid is not read: rounding moves places of a lattice by as
 much."""
 
@@ -185,7 +185,7 @@ class _Reading:
             of, vertex, share = [], [], []
             for corner in torch.cartesian_prod(*[torch.arange(2, device=self.device)] * 3):
                 factor = torch.where(corner == 1, part, 1 - part).prod(dim=1)
-                read = factor > SLIGHT
+                read = factor > MIN_VERTEX_WEIGHT
                 of.append(here[read])
                 vertex.append(((near[read] + corner) * stride).sum(dim=1))
                 share.append(factor[read])

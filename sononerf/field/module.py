@@ -89,7 +89,7 @@ def make(
     return result
 
 
-ENDLESS = 10**9
+ASSUMED_STEPS = 10**9
 """Number of steps that is assumed if a Trainer sets no end: the learning rate then stays the
 same."""
 
@@ -125,7 +125,7 @@ class EchoModule(lightning.LightningModule):
         options: Options of the fit: keys of the section ``fit`` of the settings, such as
             ``{"learning_rate": 0.05, "loss": "l2", "schedule": "staircase", "seed": 1}``.
         dynamic_range_db: Level below the loudest cell at which the fit's own compression starts;
-            the head's (``analysis``) where None.
+            the head's (``spectrogram``) where None.
         possible: Test of places against the echoes.
 
     Attributes:
@@ -186,8 +186,8 @@ class EchoModule(lightning.LightningModule):
                 "slices, such as shell"
             )
         if dynamic_range_db is None:
-            analysis = SpectrogramSettings() if self.head is None else self.head.analysis
-            dynamic_range_db = analysis.dynamic_range_db
+            spectrogram = SpectrogramSettings() if self.head is None else self.head.spectrogram
+            dynamic_range_db = spectrogram.dynamic_range_db
         self.reference = reference
         self.dynamic_range_db = dynamic_range_db
         self.options = options
@@ -296,7 +296,7 @@ class EchoModule(lightning.LightningModule):
         """Take over the length of the fit."""
         # Not earlier: Lightning would begin the first epoch before it has read a checkpoint.
         steps = float(self.trainer.estimated_stepping_batches)
-        self.total_steps = int(steps) if math.isfinite(steps) else ENDLESS
+        self.total_steps = int(steps) if math.isfinite(steps) else ASSUMED_STEPS
         self.steps_per_epoch = int(self.trainer.num_training_batches)
 
     def on_train_batch_start(self, batch: RangeSlices, batch_index: int) -> None:
@@ -404,8 +404,8 @@ class EchoModule(lightning.LightningModule):
         named = {n: p for n, p in self.named_parameters() if p.grad is not None}
         norm = get_total_norm([p.grad for p in named.values() if p.grad is not None])
         # NaNs persist, so on a GPU it is enough to look at steps whose loss is logged.
-        asked = self.renderer.may_ask or self._is_logged(self.global_step)
-        if asked and not bool(norm.isfinite()):
+        reads_norm = self.renderer.on_cpu or self._is_logged(self.global_step)
+        if reads_norm and not bool(norm.isfinite()):
             for name, parameter in named.items():
                 if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
                     raise NumericalError(

@@ -31,7 +31,7 @@ class ProfileRenderer(Renderer):
         S_e(f, r)^2 = n_f^2 + g^2 \sum_i W_f(r - r_i)\, |\rho(x_i, u_i, f)|^2
         \frac{B(f)^2 E_e(f)^2 e^{-2 \alpha_f (d_i + d_i^e)}}{(d_i\, d_i^e)^2}
 
-    The sum runs over the vertices of a lattice that are still alive. Each is deposited, linearly
+    The sum runs over the vertices of a lattice that are kept. Each is deposited, linearly
     between two bins, at :math:`r_i = (d_i + d_i^e) / 2`, emitter and ear at their true places,
     so both ears hear it at their own time; of a sweep each row hears it by the row's lag farther
     off. Spreading and absorption are known physics and stay out of the field. The kernel
@@ -44,7 +44,7 @@ class ProfileRenderer(Renderer):
     """
 
     lattice: Tensor
-    alive: Tensor
+    kept: Tensor
     energy: Tensor
     spacing: Tensor
     absorption: Tensor
@@ -77,8 +77,10 @@ class ProfileRenderer(Renderer):
         window = window.clamp(1e-6, 1.0 if self._even else None)
         last = window.shape[1] - 1
         half = last / 2
-        reach = math.ceil((half + KERNEL_SKIRT * head.sampling_rate) * per_sample / self.bin)
-        offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
+        half_width = math.ceil((half + KERNEL_SKIRT * head.sampling_rate) * per_sample / self.bin)
+        offsets = (
+            half - torch.arange(half_width + 1) * self.bin / per_sample
+        )  # from the middle down
         left = offsets.floor().long().clamp(0, last - 1)
         part = offsets - left
         floor = KERNEL_FLOOR if self._even else UNEVEN_FLOOR
@@ -88,24 +90,24 @@ class ProfileRenderer(Renderer):
             skirt = (2 * between.log()).clamp_min(floor)
             sides.append(torch.where(offsets >= 0, skirt, floor).float()[:, 1:])
         self.log_kernel = nn.Parameter(torch.cat(sides, dim=1))
-        self._taps = 2 * reach + 1
-        self.first = float(self.range[0]) - reach * self.bin
+        self._taps = 2 * half_width + 1
+        self.first = float(self.range[0]) - half_width * self.bin
         self.register_buffer("absorption", tensor(head.row_absorption))
         self.register_buffer("lag", None if head.lag is None else tensor(head.lag))
         self.log_spectrum = nn.Parameter(torch.zeros(len(self.frequency)))
         self.log_noise = nn.Parameter(torch.full((len(self.frequency),), -16.0))
         self.register_buffer("lattice", torch.zeros(0, 3))
-        self.register_buffer("alive", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("kept", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("energy", torch.zeros(0))
         self.register_buffer("spacing", torch.zeros(()))
-        self._living = (self.alive, -1, self.lattice)  # which, as of when, and where they are
+        self._kept = (self.kept, -1, self.lattice)  # which, as of when, and where they are
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         # Older runs hold buffers of removed modes, which the default mode never used.
         for name in ("phased", "wave", "opaque"):
             state_dict.pop(prefix + name, None)
         # The lattice's size is found by the fit, so a loaded one replaces ours whole.
-        for name in ("lattice", "alive", "energy"):
+        for name in ("lattice", "kept", "energy"):
             if prefix + name in state_dict:
                 found = getattr(self, name).new_zeros(state_dict[prefix + name].shape)
                 setattr(self, name, found)
@@ -114,7 +116,7 @@ class ProfileRenderer(Renderer):
     @property
     def places_per_pose(self) -> int | None:
         """Number of places that a step evaluates per pose."""
-        return min(len(self._there()), self.points) if len(self.alive) else None
+        return min(len(self._kept_places()), self.points) if len(self.kept) else None
 
     @torch.no_grad()
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
@@ -125,7 +127,7 @@ class ProfileRenderer(Renderer):
         if not self.prune_every or not step or step % self.prune_every:
             return False
         self._prune(field)
-        field.keep(self.lattice[self.alive], float(self.spacing))
+        field.keep(self.lattice[self.kept], float(self.spacing))
         if float(self.spacing) > 1.5 * field.resolution:
             self._refine(possible)
             field.keep(self.lattice, float(self.spacing))
@@ -150,7 +152,7 @@ class ProfileRenderer(Renderer):
     def _refine(self, possible: Possible | None) -> None:
         """Halve the spacing around the remaining places."""
         half = float(self.spacing) / 2
-        cell = ((self.lattice[self.alive] - self.region[0]) / half).round().long()
+        cell = ((self.lattice[self.kept] - self.region[0]) / half).round().long()
         steps = torch.arange(-1, 2, device=cell.device)
         around = torch.cartesian_prod(steps, steps, steps)
         size = ((self.region[1] - self.region[0]) / half + 1e-3).floor().long() + 1
@@ -167,13 +169,13 @@ class ProfileRenderer(Renderer):
 
     def _replace(self, places: Tensor, spacing: float) -> None:
         self.lattice = places
-        self.alive = places.new_ones(len(places), dtype=torch.bool)
+        self.kept = places.new_ones(len(places), dtype=torch.bool)
         self.energy = places.new_ones(len(places))
         self.spacing = self.spacing.new_tensor(spacing)
 
     def _prune(self, field: Field) -> None:
-        energy = field.oriented(self.lattice[self.alive], 32)[0]
-        self.energy = torch.zeros_like(self.energy).masked_scatter(self.alive, energy)
+        energy = field.oriented(self.lattice[self.kept], 32)[0]
+        self.energy = torch.zeros_like(self.energy).masked_scatter(self.kept, energy)
         # The strongest of the surroundings, judged on coarse cubes and their neighbours, so
         # that far and weak parts are not starved by a loud one.
         cell = ((self.lattice - self.region[0]) / self.surroundings).long().clamp_min(0)
@@ -182,23 +184,23 @@ class ProfileRenderer(Renderer):
         most = self.energy.new_zeros(size[0] * size[1] * size[2])
         most = most.scatter_reduce(0, flat, self.energy, "amax").reshape(1, 1, *size[::-1])
         most = F.max_pool3d(most, 3, 1, 1).reshape(-1)[flat]
-        self.alive = self.alive & (self.energy > self.prune_below * most)
+        self.kept = self.kept & (self.energy > self.prune_below * most)
 
-    def _there(self) -> Tensor:
-        """Return the places that are alive, (L, 3): the same tensor until others are."""
-        alive, version, places = self._living
-        if alive is not self.alive or version != alive._version:
+    def _kept_places(self) -> Tensor:
+        """Return the places that are kept, (L, 3): the same tensor until others are."""
+        kept, version, places = self._kept
+        if kept is not self.kept or version != kept._version:
             # Validation may come first, and its tensors have no gradients.
             with torch.inference_mode(False):
-                places = self.lattice[self.alive]
-            self._living = (self.alive, self.alive._version, places)
+                places = self.lattice[self.kept]
+            self._kept = (self.kept, self.kept._version, places)
         return places
 
     def _draw(self) -> tuple[Tensor | None, Tensor | None]:
-        """Return which of the places alive are this step's, and their weights; None for all."""
-        if not self.training or len(self._there()) <= self.points:
+        """Return which of the kept places are this step's, and their weights; None for all."""
+        if not self.training or len(self._kept_places()) <= self.points:
             return None, None
-        energy = self.energy[self.alive]
+        energy = self.energy[self.kept]
         share = (1 - self.uniform) * energy / energy.sum() + self.uniform / len(energy)
         drawn = torch.multinomial(share, self.points, replacement=True)
         return drawn, 1.0 / (share[drawn] * self.points)
@@ -227,7 +229,7 @@ class ProfileRenderer(Renderer):
         heard = torch.addcmul(noise[:, None, None], heard, gain[:, None, None])
         heard = heard.permute(2, 0, 3, 1)  # (P, E, R, B)
         whole = torch.arange(len(self.range), device=rows.device).expand(len(rows), -1)
-        if not (self.may_ask and torch.equal(rows, whole)):
+        if not (self.on_cpu and torch.equal(rows, whole)):
             heard = heard.gather(
                 2, rows[:, None, :, None].expand(-1, heard.shape[1], -1, heard.shape[3])
             )
@@ -243,23 +245,23 @@ class ProfileRenderer(Renderer):
         bins: Tensor,
     ) -> tuple[Tensor, range]:
         """Return the power in fine range bins (1, E, B, P, K), and the slices that see them."""
-        there = self._there()
+        there = self._kept_places()
         code = field.code_of_lattice(there, which)
         places = there if which is None else there[which]
         # All places in all heads are turned at once: sooner done than pair by pair.
-        turn = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
-        origin = (turn * position).sum(-1).reshape(-1, 1)
+        to_head = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
+        origin = (to_head * position).sum(-1).reshape(-1, 1)
 
         def in_heads(points: Tensor) -> Tensor:
-            return (turn.reshape(-1, 3) @ points.T - origin).reshape(3, -1)
+            return (to_head.reshape(-1, 3) @ points.T - origin).reshape(3, -1)
 
         # A place and its image; the image of a head hears the same of a place.
-        turned = [in_heads(points) for points in self._with_image(places)]
+        places_in_heads = [in_heads(points) for points in self._with_image(places)]
         echoes, at, poses = [], [], []
-        for emitters, ways in self._ways(position + rotation @ self.emitter):
+        for emitters, images in self._paths_from(position + rotation @ self.emitter):
             with torch.no_grad():
                 # Ears, vectors and frequencies come first in memory, pairs run along it.
-                if self.may_ask:
+                if self.on_cpu:
                     pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
                 else:
                     pair = torch.arange(len(position) * len(places), device=places.device)
@@ -268,8 +270,12 @@ class ProfileRenderer(Renderer):
                 # From here on a column for each pair of a pose and a place that answers it.
                 ray = emitters.T.index_select(1, pose) - places.T.index_select(1, place)
                 unit = ray / _length(ray)
-                out = turned[ways[0]].index_select(1, pair)
-                back = out if ways[0] == ways[1] else turned[ways[1]].index_select(1, pair)
+                out = places_in_heads[images[0]].index_select(1, pair)
+                back = (
+                    out
+                    if images[0] == images[1]
+                    else places_in_heads[images[1]].index_select(1, pair)
+                )
                 paths, middle = self._paths(out, back, bins)
                 paths.square_()
                 if weight is not None:
@@ -295,7 +301,7 @@ class ProfileRenderer(Renderer):
         point, normal = self.support
         return places, places - 2.0 * ((places - point) @ normal)[:, None] * normal
 
-    def _ways(self, emitters: Tensor) -> list[tuple[Tensor, tuple[int, int]]]:
+    def _paths_from(self, emitters: Tensor) -> list[tuple[Tensor, tuple[int, int]]]:
         """Return the ways of sound from emitters (P, 3) to places and back."""
         if self.support is None:
             return [(emitters, (0, 0))]
@@ -308,7 +314,7 @@ class ProfileRenderer(Renderer):
         last = len(self.range) - 1
         if not at.numel():
             return range(1)
-        if not self.may_ask:
+        if not self.on_cpu:
             return range(last + 1)
         nearest, farthest = torch.stack(at.detach().aminmax()).nan_to_num().tolist()
         first = (math.floor(nearest) - self._taps) // self.oversampling
@@ -322,26 +328,26 @@ class ProfileRenderer(Renderer):
         In: out, back ((3, M), m), bins (B,). Out: known (E, B, M), middle ((E, 1, M) or (E, B, M)).
         """
         if out is not back:
-            first, last = (self._way(*pair, bins) for pair in ((out, back), (back, out)))
+            first, last = (self._path_factor(*pair, bins) for pair in ((out, back), (back, out)))
             return first[0] + last[0], 0.5 * (first[1] + last[1])
-        return self._way(out, back, bins)
+        return self._path_factor(out, back, bins)
 
-    def _way(self, emitted: Tensor, heard: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
+    def _path_factor(self, emitted: Tensor, heard: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
         """Return the factor of one of the ways; see :meth:`_paths`."""
         ray = heard - self.ear_positions[..., None]  # (E, 3, M)
         back = _length(ray)
         head = (ray / back[:, None]).mT
         ray = emitted - self.emitter[:, None]
         out = _length(ray)
-        way = out + back  # (E, M) m, there and back
+        path = out + back  # (E, M) m, there and back
         # Each pass is made once, and in place: memory traffic limits the speed.
         gain = look_up(self.ears.index_select(1, bins), head).mT
         gain *= look_up(self.beam.index_select(0, bins), (ray / out).T).T
         absorption = self.absorption[bins]
         factors = torch.stack((absorption, torch.ones_like(absorption)), dim=1)
-        lengths = torch.stack((way, torch.log(out * back)), dim=1)
+        lengths = torch.stack((path, torch.log(out * back)), dim=1)
         gain *= (-factors @ lengths).exp_()
-        middle = ((way / 2 - self.first) / self.bin)[:, None]
+        middle = ((path / 2 - self.first) / self.bin)[:, None]
         if self.lag is not None:
             middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
         return gain, middle

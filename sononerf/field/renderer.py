@@ -94,7 +94,7 @@ class Renderer(nn.Module):
         self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))
 
     @property
-    def may_ask(self) -> bool:
+    def on_cpu(self) -> bool:
         """True if reading a scalar does not synchronise the device.
 
         Reading a scalar lets a GPU finish all queued work first, so a step must do without.
@@ -233,8 +233,8 @@ class Window(torch.autograd.Function):
         seen[..., 1:, 1, :] = part
         seen = seen.reshape(*lead, poses * (tiles + 1), 2 * tile)
         spread = (seen @ band.mT).reshape(*lead, poses, -1)[..., :length]
-        met = (blocks.mT @ seen).flatten(0, -4).sum(0).flatten(1)
-        weight = met.new_zeros(len(met), taps + 1).index_add_(1, tap, met)[:, :taps]
+        counts = (blocks.mT @ seen).flatten(0, -4).sum(0).flatten(1)
+        weight = counts.new_zeros(len(counts), taps + 1).index_add_(1, tap, counts)[:, :taps]
         return spread, weight, None
 
 
@@ -281,7 +281,7 @@ class ShellRenderer(Renderer):
         call_spectrum: Literal["flat", "learned"] = "flat",
     ) -> None:
         super().__init__(region, head)
-        self.told = direction
+        self.direction_input = direction
         sphere = sphere_directions(2 * directions, self.range)
         # Turned so that the lattice's axis is the head's: its first half is then the hemisphere.
         forward = sphere[:directions][:, [2, 0, 1]]
@@ -308,7 +308,9 @@ class ShellRenderer(Renderer):
         world = torch.einsum("pij,dj->pdi", rotation, self.directions)  # (P, D, 3)
         places = position[:, None, None] + self.range[rows][..., None, None] * world[:, None]
         directions = (
-            -world if self.told == "incidence" else -rotation[:, None, :, 0].expand(world.shape)
+            -world
+            if self.direction_input == "incidence"
+            else -rotation[:, None, :, 0].expand(world.shape)
         )
         directions = directions[:, None].expand(places.shape)
         inside = field.inside(places)  # (P, R, D)

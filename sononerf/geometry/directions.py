@@ -128,8 +128,8 @@ class CapSpiral:
             corner = self._at(ends, np.full(rows, aside))
             apart = np.linalg.norm(corner - self._at(share, np.zeros(rows)), axis=1)
             radius = np.maximum(radius, 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)))
-        reach = np.cos(np.minimum(half_angle + 1.1 * radius[:, None], math.pi)) - 1e-9
-        near = (middle @ towards.T).reshape(rows, columns, -1) >= reach[:, None]
+        min_cosine = np.cos(np.minimum(half_angle + 1.1 * radius[:, None], math.pi)) - 1e-9
+        near = (middle @ towards.T).reshape(rows, columns, -1) >= min_cosine[:, None]
         chosen: Bools = np.asarray(near.any(axis=2))
         return _in_patches(chosen, self.count, *self.offset)
 
@@ -195,15 +195,15 @@ def _on_sphere(share: Floats, turn: Floats, depth: float, axes: Floats) -> Float
 def _in_patches(chosen: Bools, count: int, shift: float, turn: float) -> Ints:
     """Return which directions of a spiral lie in chosen patches (rows, columns), ascending."""
     rows, columns = chosen.shape
-    index, count_found = np.zeros(count, np.int64), 0
+    index, count_inside = np.zeros(count, np.int64), 0
     for i in range(count):
         around = i * GOLDEN_TURN + turn
         around -= math.floor(around)
         row = min(int((i + shift) / count * rows), rows - 1)
         if chosen[row, min(int(around * columns), columns - 1)]:
-            index[count_found] = i
-            count_found += 1
-    return index[:count_found].copy()
+            index[count_inside] = i
+            count_inside += 1
+    return index[:count_inside].copy()
 
 
 def _cell_steps(ring: Floats, depth: float) -> tuple[Ints, Ints]:

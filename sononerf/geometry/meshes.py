@@ -141,7 +141,7 @@ def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, F
     return np.stack([centre for centre, _, _ in found]), np.array([r for _, r, _ in found])
 
 
-FLAT = 1e-7
+MIN_TRIANGLE_HEIGHT = 1e-7
 """Height of a triangle over the size of the surface below which it has no area in single
 precision."""
 
@@ -149,7 +149,7 @@ precision."""
 def surface_faults(mesh: trimesh.Trimesh) -> list[str]:
     """Return the faults of a surface."""
     lines = []
-    good = mesh.nondegenerate_faces(height=FLAT * float(mesh.scale))
+    good = mesh.nondegenerate_faces(height=MIN_TRIANGLE_HEIGHT * float(mesh.scale))
     if not good.all():
         lines.append(
             f"the mesh has {_count((~good).sum(), 'triangle')} without area; nothing is heard there"
@@ -206,7 +206,7 @@ class Plane:
         return a * x + b * y + c * z
 
     @property
-    def turn(self) -> Floats:
+    def reflection(self) -> Floats:
         """Matrix (3, 3) that mirrors vectors (..., 3) by multiplication from either side."""
         normal = np.asarray(self.normal)
         return np.eye(3) - 2.0 * np.outer(normal, normal)
@@ -214,7 +214,7 @@ class Plane:
     def mirrored(self, points: Floats) -> Floats:
         """Return the images (..., 3) of points (..., 3), m."""
         at = np.asarray(self.point)
-        return (np.asarray(points) - at) @ self.turn + at
+        return (np.asarray(points) - at) @ self.reflection + at
 
     def with_image(self, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Bools | None]:
         """Return the part of a mesh above the plane, and its image, as one mesh.

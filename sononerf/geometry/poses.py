@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.display import Shown, number_in, read_rows
+from sononerf.display import NotebookRepr, number_in, read_rows
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
 from sononerf.numerics import Floats
@@ -29,7 +29,7 @@ CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
 
 @dataclass(frozen=True, eq=False)
-class Poses(Shown):
+class Poses(NotebookRepr):
     """Positions and orientations of the head.
 
     Attributes:
@@ -268,8 +268,8 @@ def _aimed(
 ) -> Poses:
     """Look at targets, then off them by two random turns about the head's own y and z."""
     about_y, about_z = aim_jitter * generator.standard_normal((2, len(positions)))
-    turned = look_at(positions, targets) @ rotation_from_euler(about_z, about_y, 0.0)
-    return Poses(positions, look_at(np.zeros_like(positions), turned[:, :, 0]))
+    jittered = look_at(positions, targets) @ rotation_from_euler(about_z, about_y, 0.0)
+    return Poses(positions, look_at(np.zeros_like(positions), jittered[:, :, 0]))
 
 
 def random_sphere_poses(
@@ -327,10 +327,10 @@ def random_poses(
     return _aimed(places, aim_jitter, generator)
 
 
-ASIDE = np.radians(45.0)
+MAX_AIM_ERROR = np.radians(45.0)
 """Median angle between the heads' aim and the body above which a mistake is suspected, rad. Bats
 aim within some degrees; a call is half as loud 30 to 40 degrees off its axis."""
-EXPLAINED = np.radians(20.0)
+MAX_EXPLAINED_AIM_ERROR = np.radians(20.0)
 """Median angle between the heads' corrected aim and the body below which a suspected mistake counts
 as the explanation, rad."""
 
@@ -354,7 +354,7 @@ def aim_fault(poses: Poses, centre: Floats) -> str:
     if not len(poses):
         return ""
     stated = float(np.median(off_axis(poses, centre)))
-    if stated < ASIDE:
+    if stated < MAX_AIM_ERROR:
         return ""
     yaw, pitch, roll = (np.asarray(a) for a in euler_from_rotation(poses.rotations))
     others: dict[str, list[Floats]] = {
@@ -368,10 +368,10 @@ def aim_fault(poses: Poses, centre: Floats) -> str:
         others["angles are in radians, and are read as degrees"] = degrees
     angles = {}
     for name, turns in others.items():
-        turned = Poses(poses.positions, rotation_from_euler(*turns))
-        angles[name] = float(np.median(off_axis(turned, centre)))
+        corrected = Poses(poses.positions, rotation_from_euler(*turns))
+        angles[name] = float(np.median(off_axis(corrected, centre)))
     best = min(angles, key=angles.__getitem__)
-    cause = f"; perhaps {best}" if angles[best] < min(EXPLAINED, stated / 2.0) else ""
+    cause = f"; perhaps {best}" if angles[best] < min(MAX_EXPLAINED_AIM_ERROR, stated / 2.0) else ""
     where = "look away from" if stated > np.pi / 2.0 else "look past"
     return f"poses {where} the body, by {np.degrees(stated):.0f} degrees in the median{cause}"
 

@@ -103,8 +103,8 @@ class _VtkEngine:
         return int(cell) if found else -1
 
     def first(self, origins: Floats, directions: Floats) -> Ints:
-        reach = self._reach + np.linalg.norm(origins, axis=1, keepdims=True)
-        ends = origins + reach * directions
+        length = self._reach + np.linalg.norm(origins, axis=1, keepdims=True)
+        ends = origins + length * directions
         return np.array([self._search(a, b) for a, b in zip(origins, ends, strict=True)], np.int64)
 
     def blocked(self, origins: Reals, spans: Reals) -> Bools:
@@ -200,8 +200,8 @@ def _sight(
                 length += (target[k] - points[i, k]) ** 2
             by = lift / math.sqrt(length) if length > 0.0 else 0.0
         for k in range(3):
-            way = target[k] - points[i, k] if len(normals) == 0 else normals[i, k]
-            lifted = points[i, k] + by * way
+            direction = target[k] - points[i, k] if len(normals) == 0 else normals[i, k]
+            lifted = points[i, k] + by * direction
             origins[i, k] = (lifted - middle[k]) * scale
             spans[i, k] = (target[k] - lifted) * scale
     return origins, spans

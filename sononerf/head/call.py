@@ -23,7 +23,7 @@ from sononerf.numerics import Bools, Floats
 from sononerf.settings.schema import FILE_SECTIONS, CallSettings, EarSettings
 from sononerf.storage import read_wav
 
-LOUD = 0.25
+MIN_HARMONIC = 0.25
 """Height of a harmonic, over that of the loudest one, from which it counts. Fainter echoes are not
 taken for onsets, which are read at a tenth of the power."""
 
@@ -129,7 +129,7 @@ def _carrier(settings: CallSettings, frequency: Floats) -> tuple[Floats, Floats]
     time = _time_of(settings, np.clip(f, low, high), harmonic)
     near = off == off.min(axis=1, keepdims=True)
     loudness = np.where(near, slowness * _envelope(settings, time), 0.0)
-    loud = near & (loudness >= LOUD * loudness.max(axis=1, keepdims=True))
+    loud = near & (loudness >= MIN_HARMONIC * loudness.max(axis=1, keepdims=True))
     first = np.where(loud, time, np.inf).argmin(axis=1)
     return harmonic[first], np.clip(frequency, low[first], high[first])
 
@@ -235,15 +235,15 @@ def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> Floats:
     return compressed[..., :samples]
 
 
-LONGEST = 0.1  # s, as the settings' longest sweep
-SHORTEST = 8  # samples
+MAX_DURATION = 0.1  # s, as the settings' longest sweep
+MIN_SAMPLES = 8  # samples
 MOST_BYTES = 16_000_000
 LARGEST_STEP = 10_000  # of a ratio of sampling rates
 COVERED_DB = 20.0  # below the loudest frequency
 SMOOTHING = 0.1  # of a spectrum to both sides, in bandwidths of the window
 ENERGY = 0.99  # that a call's duration holds
 LOUD_POWER = 0.0625  # of the power, 12 dB below the loudest: what is fainter is passed over
-TOP = 0.7  # of an output's power: what lies above it tells the time
+TOP_POWER = 0.7  # of an output's power: what lies above it tells the time
 ROWS = 200  # frequencies that the delay is read at
 
 
@@ -311,18 +311,19 @@ def load_call(path: Path) -> CallFile:
 def _load(path: Path, changed: int, size: int) -> CallFile:
     del changed
     if size > MOST_BYTES:
-        raise InputError(f"{path}: {size:,} bytes; cut one call out, of {LONGEST:g} s at most")
+        raise InputError(f"{path}: {size:,} bytes; cut one call out, of {MAX_DURATION:g} s at most")
     rate, samples = read_wav(path)
     if samples.ndim != 1:
         raise InputError(
             f"{path}: {samples.shape[1]} channels, expected 1; write out the channel of the call"
         )
-    if len(samples) > LONGEST * rate:
+    if len(samples) > MAX_DURATION * rate:
         raise InputError(
-            f"{path}: lasts {len(samples) / rate:.3g} s, allowed is {LONGEST:g} s; cut one call out"
+            f"{path}: lasts {len(samples) / rate:.3g} s, allowed is "
+            f"{MAX_DURATION:g} s; cut one call out"
         )
-    if len(samples) < SHORTEST:
-        raise InputError(f"{path}: {len(samples)} samples, expected {SHORTEST} or more")
+    if len(samples) < MIN_SAMPLES:
+        raise InputError(f"{path}: {len(samples)} samples, expected {MIN_SAMPLES} or more")
     waveform = samples.astype(np.float64)
     if samples.dtype == np.uint8:
         waveform -= 128.0  # 8 bits are stored without a sign
@@ -337,7 +338,7 @@ def _load(path: Path, changed: int, size: int) -> CallFile:
 def _examined(waveform: Floats, rate: float) -> CallFile:
     duration, band = _duration(waveform, rate), _bandwidth(waveform, rate)
     length = math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * duration / band)
-    window = np.hamming(max(round(length * rate), SHORTEST))
+    window = np.hamming(max(round(length * rate), MIN_SAMPLES))
     bandwidth = WINDOW_BANDWIDTH * rate / len(window)
     frequency = np.linspace(0.0, rate / 2.0, ROWS + 1)[1:]
     size = int(scipy.fft.next_fast_len(len(waveform) + 2 * len(window)))
@@ -350,10 +351,10 @@ def _examined(waveform: Floats, rate: float) -> CallFile:
         kernel = np.fft.fft(window * np.exp(1j * ring * middle), size)
         power = np.abs(np.fft.ifft(spectrum * kernel)) ** 2
         top = _first_top(power)
-        low = np.flatnonzero(power < TOP * power[top])
+        low = np.flatnonzero(power < TOP_POWER * power[top])
         first = int(low[low < top].max(initial=-1)) + 1
         last = int(low[low > top].min(initial=size))
-        above = power[first:last] - TOP * power[top] + 1e-300
+        above = power[first:last] - TOP_POWER * power[top] + 1e-300
         delay[row] = np.average(time[first:last], weights=above)
     loud = _loud(waveform, rate, frequency, bandwidth)
     return CallFile(waveform, rate, frequency, np.maximum(delay, 0.0), loud, bandwidth)

@@ -17,7 +17,7 @@ RANGE_DB = 60.0
 """Level of the loudest cell above the reference, dB; also the scale of PSNR and SSIM."""
 ACTIVE_DB = 3.0
 """Level from which a cell is active, dB."""
-EXCEEDED = 1e-3
+FALSE_ACTIVE_RATE = 1e-3
 """Probability that a cell of noise counts as active, no unit: one cell in a thousand does not move
 a mean over active cells."""
 CHUNK_POSES = 8
@@ -41,7 +41,7 @@ def active_level(noise: ArrayLike | None, reference: float) -> float | Floats:
     """
     if noise is None:
         return ACTIVE_DB
-    exceeded = np.asarray(noise, dtype=np.float64) * math.sqrt(math.log(1.0 / EXCEEDED))
+    exceeded = np.asarray(noise, dtype=np.float64) * math.sqrt(math.log(1.0 / FALSE_ACTIVE_RATE))
     return np.maximum(compress(exceeded, reference), ACTIVE_DB)[:, None]
 
 

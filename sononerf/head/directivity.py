@@ -16,7 +16,7 @@ from sononerf.numerics import Floats, Ints
 
 FADE = math.radians(10.0)
 """Angle outside the measured area over which the gain falls to zero, rad."""
-GAP = 3.0
+MAX_TRIANGLE_WIDTH = 3.0
 """Width of a triangle's circumscribed circle, over the usual width, above which the triangle
 belongs to no measured area."""
 BACKGROUND = 2000
@@ -25,7 +25,7 @@ LEAST_SPACING, MOST_SPACING = math.radians(0.5), math.radians(12.0)
 BULGE = 1e-4
 """The sphere is deformed by this fraction before it is triangulated. So the diagonals of the
 cells of a regular grid do not depend on rounding or on the order of the directions."""
-SAME = 1e-6  # rad; directions nearer than this are one
+SAME_DIRECTION = 1e-6  # rad; directions nearer than this are one
 CHUNK = 512
 
 
@@ -38,7 +38,7 @@ def interpolation(given: Floats, directions: Floats) -> csr_array:
 
     In: given (M, 3), directions (N, 3). Out: weights ((N, M) sparse float64).
     """
-    cells = np.round(given / SAME).astype(np.int64)
+    cells = np.round(given / SAME_DIRECTION).astype(np.int64)
     _, first, same = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     same = same.reshape(-1)
     counts = np.bincount(same)
@@ -48,14 +48,16 @@ def interpolation(given: Floats, directions: Floats) -> csr_array:
     tree = cKDTree(points)
     around = fibonacci_sphere(BACKGROUND)
     far, nearest = tree.query(around)
-    outside = 2.0 * np.arcsin(np.minimum(far / 2.0, 1.0)) > GAP * spacing
+    outside = 2.0 * np.arcsin(np.minimum(far / 2.0, 1.0)) > MAX_TRIANGLE_WIDTH * spacing
     around, nearest = around[outside], nearest[outside]
     every = np.concatenate([points, around])
     # A direction that fills the rest has the value of the nearest measured one.
     source = np.concatenate([np.arange(len(points)), nearest])
     hull = _hull(every)
     triangles = np.asarray(hull.simplices, dtype=np.int64)
-    measured = (triangles < len(points)).all(axis=1) & (_radius(every, triangles) <= GAP * spacing)
+    measured = (triangles < len(points)).all(axis=1) & (
+        _radius(every, triangles) <= MAX_TRIANGLE_WIDTH * spacing
+    )
     facet, weights = _locate(every, hull, directions)
     off = 2.0 * np.arcsin(np.minimum(tree.query(directions)[0] / 2.0, 1.0)) - spacing
     fade = np.where(measured[facet], 1.0, np.clip(1.0 - off / FADE, 0.0, 1.0))
@@ -108,9 +110,9 @@ def _parts(directions: Floats) -> list[Floats]:
 
 
 MOST_RECEIVERS = 256
-FEW = 3
+MIN_DIRECTIONS = 3
 """Number of directions below which they always lie in one plane."""
-FLAT = 0.1
+PLANAR_RATIO = 0.1
 """Thickness of a set of directions over its width below which it counts as a plane, no unit.
 Elevations of a few degrees with azimuths all around are such a set."""
 
@@ -183,10 +185,10 @@ class Directivity:
     @property
     def is_flat(self) -> bool:
         """Whether all directions lie in one plane: a circle around the head was measured."""
-        if len(self.directions) < FEW:
+        if len(self.directions) < MIN_DIRECTIONS:
             return False
         size = np.linalg.svd(self.directions, compute_uv=False) / math.sqrt(len(self.directions))
-        return bool(size[2] < FLAT * size[1])
+        return bool(size[2] < PLANAR_RATIO * size[1])
 
     def weights(self, directions: Floats) -> csr_array:
         """Return the weights (N, M) that bring gains to directions (N, 3); rows sum to 1 or less.

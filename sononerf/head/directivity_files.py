@@ -255,8 +255,8 @@ class _Sofa:
             return self._transducer(frequency, gains)
         measurements, receivers = gains.shape[:2]
         source = self._position("SourcePosition", measurements)
-        ways = source - self._position("ListenerPosition", measurements, [[0.0, 0.0, 0.0]])
-        directions = np.einsum("mij,mj->mi", self._frame("Listener", measurements), ways)
+        offsets = source - self._position("ListenerPosition", measurements, [[0.0, 0.0, 0.0]])
+        directions = np.einsum("mij,mj->mi", self._frame("Listener", measurements), offsets)
         places = self._position("ReceiverPosition", receivers, [[0.0, 0.0, 0.0]])
         last = str(getattr(self.file, EMITTER_ATTRIBUTE, "")) == EMITTER
         emitting = [receivers - 1] if last else []
@@ -279,8 +279,8 @@ class _Sofa:
         receivers = self._position("ReceiverPosition", gains.shape[1])
         source = self._position("SourcePosition", 1, [[0.0, 0.0, 0.0]])
         listener = self._position("ListenerPosition", 1, [[0.0, 0.0, 0.0]])
-        ways = receivers @ self._frame("Listener", 1)[0] + listener - source
-        directions = self._units(ways @ self._frame("Source", 1)[0].T)
+        offsets = receivers @ self._frame("Listener", 1)[0] + listener - source
+        directions = self._units(offsets @ self._frame("Source", 1)[0].T)
         return Directivity(str(self.path), directions, frequency, gains, beam=gains[0])
 
     def _numbers(self, name: str, otherwise: Any = None) -> NDArray[Any]:

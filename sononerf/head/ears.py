@@ -226,7 +226,7 @@ def _measured_tables(measured: Directivity, frequency: Floats) -> tuple[Singles,
 
 
 def analysed_ears(
-    settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings
+    settings: EarSettings, call: CallSettings, spectrogram: SpectrogramSettings
 ) -> tuple[Ears, Singles | None]:
     r"""Tables of the same head as an analysis hears it: smeared over frequency by its window.
 
@@ -247,15 +247,15 @@ def analysed_ears(
 
     Out: lag ((E, F, L, A) float32 or None, s).
     """
-    return _analysed(settings, call, analysis, directivity_content(settings))
+    return _analysed(settings, call, spectrogram, directivity_content(settings))
 
 
 @lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
 def _analysed(
-    settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings, content: str | None
+    settings: EarSettings, call: CallSettings, spectrogram: SpectrogramSettings, content: str | None
 ) -> tuple[Ears, Singles | None]:
     del content  # a changed file is read again
-    fine_frequency, rows, weight, later = smearing(call, analysis)
+    fine_frequency, rows, weight, later = smearing(call, spectrogram)
     fine = ear_tables(settings, fine_frequency)
 
     def smeared(table: Floats, weight: NDArray[Any]) -> NDArray[Any]:
@@ -286,7 +286,7 @@ def _analysed(
         return np.broadcast_to(stacked, (len(fine.positions), *stacked.shape[1:]))
 
     analysed = dataclasses.replace(
-        fine, frequency=frequency_axis(analysis), beam=beam.astype(np.float32), ears=of_all(ears)
+        fine, frequency=frequency_axis(spectrogram), beam=beam.astype(np.float32), ears=of_all(ears)
     )
     return analysed, of_all(lags) if lags else None
 

@@ -70,11 +70,11 @@ def echo_samples(
     In: speed_of_sound (m/s), longest_delay (s).
     """
     last = _frames(settings, speed_of_sound)[1]
-    reach = row_filters(settings).reach
-    return last * settings.hop + reach + math.ceil(longest_delay * settings.sampling_rate)
+    half_length = row_filters(settings).reach
+    return last * settings.hop + half_length + math.ceil(longest_delay * settings.sampling_rate)
 
 
-def spectrogram(
+def dechirped_spectrogram(
     echo: ArrayLike,
     settings: SpectrogramSettings,
     speed_of_sound: float,
@@ -159,8 +159,8 @@ class Smearing(NamedTuple):
     later: Floats | None
 
 
-def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
-    """Return the response of the rows of an analysis to a call.
+def smearing(call: CallSettings, spectrogram: SpectrogramSettings) -> Smearing:
+    """Return the response of the rows to a call.
 
     A filter does not resolve frequencies closer than its bandwidth: it smears a varying spectrum
     over them. Of an impulse the value at the middle of an echo is the spectrum's mean under the
@@ -168,31 +168,31 @@ def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     other; by Parseval's theorem a row hears the mean power, each frequency weighted with the
     squares of the filter's transform and of the call's spectrum.
     """
-    return (_of_gammatones if analysis.kind == "gammatone" else _of_a_window)(call, analysis)
+    return (_of_gammatones if spectrogram.kind == "gammatone" else _of_a_window)(call, spectrogram)
 
 
-def _of_a_window(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
-    frequencies = frequency_axis(analysis)
-    step = analysis.sampling_rate / analysis.fft
-    window = np.hamming(analysis.window)
+def _of_a_window(call: CallSettings, spectrogram: SpectrogramSettings) -> Smearing:
+    frequencies = frequency_axis(spectrogram)
+    step = spectrogram.sampling_rate / spectrogram.fft
+    window = np.hamming(spectrogram.window)
     # The transform about the window's own middle is real; two main lobes on each side suffice.
-    reach = math.ceil(4.0 * analysis.fft / analysis.window)
-    time = np.arange(analysis.window) - (analysis.window - 1) / 2.0
-    offsets = np.arange(-reach, reach + 1)
-    smear = np.cos(2.0 * np.pi / analysis.fft * np.outer(offsets, time)) @ window
-    first = round(float(frequencies[0]) / step) - reach
-    count = len(frequencies) + 2 * reach
+    half_width = math.ceil(4.0 * spectrogram.fft / spectrogram.window)
+    time = np.arange(spectrogram.window) - (spectrogram.window - 1) / 2.0
+    offsets = np.arange(-half_width, half_width + 1)
+    smear = np.cos(2.0 * np.pi / spectrogram.fft * np.outer(offsets, time)) @ window
+    first = round(float(frequencies[0]) / step) - half_width
+    count = len(frequencies) + 2 * half_width
     # Below the first bin and above half the sampling rate there is nothing to hear.
-    bins = np.clip(np.arange(first, first + count), 1, analysis.fft // 2)
+    bins = np.clip(np.arange(first, first + count), 1, spectrogram.fft // 2)
     fine = bins.clip(1) * step + np.arange(count) * 1e-9
     rows = np.arange(len(frequencies))[:, None] + np.arange(
-        2 * reach + 1
+        2 * half_width + 1
     )  # (F, K) of the fine bins
     if call.kind == "impulse":
         return Smearing(fine, rows, np.tile(smear / smear.sum(), (len(frequencies), 1)), None)
-    waveform = call_waveform(call, analysis.sampling_rate)
-    finer = math.ceil(len(waveform) / analysis.fft)
-    emitted = np.fft.rfft(waveform, finer * analysis.fft)[finer * bins]
+    waveform = call_waveform(call, spectrogram.sampling_rate)
+    finer = math.ceil(len(waveform) / spectrogram.fft)
+    emitted = np.fft.rfft(waveform, finer * spectrogram.fft)[finer * bins]
     weight = smear**2 * (np.abs(emitted) ** 2)[rows]
     weight /= weight.sum(axis=1, keepdims=True)
     delay = sweep_delay(call, bins * step)
@@ -201,14 +201,14 @@ def _of_a_window(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     )
 
 
-def _of_gammatones(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
-    filters, rate = row_filters(analysis), analysis.sampling_rate
+def _of_gammatones(call: CallSettings, spectrogram: SpectrogramSettings) -> Smearing:
+    filters, rate = row_filters(spectrogram), spectrogram.sampling_rate
     frequencies = filters.frequency
     # Fine frequencies are some to a channel, and some to a bandwidth, in equal ratios too.
     between = math.log(frequencies[-1] / frequencies[0]) / (len(frequencies) - 1)
-    finer = max(1, math.ceil(4.0 * analysis.q * between))
+    finer = max(1, math.ceil(4.0 * spectrogram.q * between))
     step = between / finer
-    skirt = SKIRT * BANDWIDTH / analysis.q
+    skirt = SKIRT * BANDWIDTH / spectrogram.q
     below = math.ceil(-math.log(max(1.0 - skirt, 1.0 / WIDEST)) / step)
     above = math.ceil(math.log(1.0 + skirt) / step)
     count = finer * (len(frequencies) - 1) + 1 + below + above

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.display import Shown
+from sononerf.display import NotebookRepr
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.meshes import Plane
 from sononerf.head.air import absorption_in, speed_in
 from sononerf.head.call import call_waveform, covered, emit, load_call, sweep_delay
 from sononerf.head.ears import Ears, analysed_ears, ear_tables, receiver_places
-from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, echo_samples, frequency_axis, range_axis
 from sononerf.head.reception import (
     draw_noise,
     effective_window,
@@ -60,18 +60,18 @@ class PointEcho:
 
     @classmethod
     def of(
-        cls, call: CallSettings, analysis: SpectrogramSettings, speed_of_sound: float
+        cls, call: CallSettings, spectrogram: SpectrogramSettings, speed_of_sound: float
     ) -> PointEcho:
-        """Return the echo of a call (m/s) in an analysis."""
-        rows = effective_window(call, analysis)
-        filters = row_filters(analysis)
+        """Return the echo of a call (m/s) in a spectrogram."""
+        rows = effective_window(call, spectrogram)
+        filters = row_filters(spectrogram)
         swept = covered(call, filters.frequency)
         kept = swept if swept.any() else np.arange(len(rows)) < 1
         part = band_parts(filters.frequency)
         return cls(
             window=band_mean((rows[kept] ** 2).T, filters.frequency[kept]),
             rows=None if part is None else rows**2 * (part * kept)[:, None],
-            spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
+            spacing=speed_of_sound / 2.0 / spectrogram.sampling_rate,
             looks=filters.looks,
         )
 
@@ -107,11 +107,15 @@ def own_top(window: Floats) -> int:
     return top
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class Head(Shown):
-    """Emitter and receivers in air, the call, and the analysis that makes spectrograms.
+SECTIONS = ("ears", "call", "air", "spectrogram", "noise", "support")
+"""Sections of the settings that describe a head."""
 
-    Two synthetic ears, an impulse and the analysis of the paper by default. Slow results are
+
+@dataclass(frozen=True, eq=False, init=False)
+class Head(NotebookRepr):
+    """Emitter and receivers in air, the call, and the filters that make spectrograms.
+
+    Two synthetic ears, an impulse and the filters of the paper by default. Slow results are
     computed at their first use, and kept.
 
     Args:
@@ -122,7 +126,7 @@ class Head(Shown):
             "duration": 1e-3, "frequency_start": 90e3, "frequency_end": 30e3}``, or ``{"kind":
             "file", "file": "call.wav"}``.
         air: Speed of sound and absorption: section ``air``, such as ``{"temperature_c": 20}``.
-        analysis: Filters, hop, range limits, Hz and m: section ``spectrogram``, such as
+        spectrogram: Filters, hop, range limits, Hz and m: section ``spectrogram``, such as
             ``{"frequency_min": 20e3, "frequency_max": 90e3, "range_max": 1.0}``.
         noise: Noise of the receivers: section ``noise``, such as ``{"snr_db": 20}``.
         support: A rigid plane that the body stands on, m, world frame: section ``support``, such as
@@ -141,7 +145,7 @@ class Head(Shown):
     ears: EarSettings
     call: CallSettings
     air: AirSettings
-    analysis: SpectrogramSettings
+    spectrogram: SpectrogramSettings
     noise: NoiseSettings
     support: SupportSettings
 
@@ -150,15 +154,19 @@ class Head(Shown):
         ears: EarSettings | Mapping[str, Any] | None = None,
         call: CallSettings | Mapping[str, Any] | None = None,
         air: AirSettings | Mapping[str, Any] | None = None,
-        analysis: SpectrogramSettings | Mapping[str, Any] | None = None,
+        spectrogram: SpectrogramSettings | Mapping[str, Any] | None = None,
         noise: NoiseSettings | Mapping[str, Any] | None = None,
         support: SupportSettings | Mapping[str, Any] | None = None,
+        **unknown: object,
     ) -> None:
+        if unknown:
+            fault = f"Head has no section {next(iter(unknown))!r}; the filters are spectrogram="
+            raise SettingsError(f"{fault} (analysis= before 0.2.0)")
         for name, kind, given in (
             ("ears", EarSettings, ears),
             ("call", CallSettings, call),
             ("air", AirSettings, air),
-            ("analysis", SpectrogramSettings, analysis),
+            ("spectrogram", SpectrogramSettings, spectrogram),
             ("noise", NoiseSettings, noise),
             ("support", SupportSettings, support),
         ):
@@ -170,7 +178,7 @@ class Head(Shown):
                 f"receiver{'s' * (count != 1)}; give one level for all"
             )
         try:
-            check_call(self.call, self.analysis)
+            check_call(self.call, self.spectrogram)
         except ValueError as error:
             raise SettingsError(str(error)) from None
         if self.call.file is not None:
@@ -178,17 +186,12 @@ class Head(Shown):
 
     def plain(self) -> dict[str, Any]:
         """Return the sections of the settings that describe this head, as plain data."""
-        named = {"ears": self.ears, "call": self.call, "air": self.air}
-        sections = {**named, "spectrogram": self.analysis, "noise": self.noise}
-        sections["support"] = self.support
-        return {name: section.model_dump(mode="json") for name, section in sections.items()}
+        return {name: getattr(self, name).model_dump(mode="json") for name in SECTIONS}
 
     @classmethod
     def from_plain(cls, sections: Mapping[str, Any]) -> Head:
         """Return the head that :meth:`plain` described."""
-        given = {"analysis" if k == "spectrogram" else k: v for k, v in sections.items()}
-        names = ("ears", "call", "air", "analysis", "noise", "support")
-        return cls(**{name: given[name] for name in names if name in given})
+        return cls(**{name: sections[name] for name in SECTIONS if name in sections})
 
     def __getstate__(self) -> dict[str, object]:
         # Other processes compute these again if needed; the tables are large.
@@ -244,17 +247,17 @@ class Head(Shown):
     @property
     def sampling_rate(self) -> float:
         """Sampling rate of waveforms, Hz."""
-        return self.analysis.sampling_rate
+        return self.spectrogram.sampling_rate
 
     @cached_property
     def frequency(self) -> Floats:
         """Frequencies of the spectrogram's rows (F,), Hz."""
-        return frequency_axis(self.analysis)
+        return frequency_axis(self.spectrogram)
 
     @cached_property
     def range(self) -> Floats:
         """Ranges of the spectrogram's slices (R,), m."""
-        return range_axis(self.analysis, self.speed_of_sound)
+        return range_axis(self.spectrogram, self.speed_of_sound)
 
     @property
     def wavelength(self) -> float:
@@ -264,12 +267,12 @@ class Head(Shown):
     @cached_property
     def row_filters(self) -> RowFilters:
         """Filters of the spectrogram's rows."""
-        return row_filters(self.analysis)
+        return row_filters(self.spectrogram)
 
     @cached_property
     def point_echo(self) -> PointEcho:
         """The echo of a single point in the spectrogram."""
-        return PointEcho.of(self.call, self.analysis, self.speed_of_sound)
+        return PointEcho.of(self.call, self.spectrogram, self.speed_of_sound)
 
     @property
     def resolution(self) -> float:
@@ -279,7 +282,7 @@ class Head(Shown):
     @cached_property
     def window(self) -> Floats:
         """Magnitude of a point echo in each row (F, W), one value per sample, 1 in the middle."""
-        return effective_window(self.call, self.analysis)
+        return effective_window(self.call, self.spectrogram)
 
     def tables(self, frequency: ArrayLike) -> Ears:
         """Return the gains of emitter and receivers at frequencies (F,), Hz."""
@@ -292,7 +295,7 @@ class Head(Shown):
 
     @cached_property
     def _smeared(self) -> tuple[Ears, Singles | None]:
-        return analysed_ears(self.ears, self.call, self.analysis)
+        return analysed_ears(self.ears, self.call, self.spectrogram)
 
     @property
     def row_gains(self) -> Ears:
@@ -332,7 +335,7 @@ class Head(Shown):
     @cached_property
     def samples(self) -> int:
         """Number of samples from the emission to the end of the last frame."""
-        return echo_samples(self.analysis, self.speed_of_sound, float(self.delay.max()))
+        return echo_samples(self.spectrogram, self.speed_of_sound, float(self.delay.max()))
 
     def receive(self, impulse_responses: ArrayLike, *, seed: int) -> tuple[Floats, Floats]:
         """Return the pressure at the receivers, noise included, and its spectrogram.
@@ -350,16 +353,16 @@ class Head(Shown):
         waveform = emit(impulse_responses, self.waveform)[:, : self.samples]
         if self.noise.snr_db is not None:
             if self.noise.relative_to == "pose":
-                power = loudest_power(waveform, self.analysis, self._stretch)
+                power = loudest_power(waveform, self.spectrogram, self._stretch)
             else:
                 power = np.repeat(self._target_power, len(waveform))
-            level = noise_level(self.noise, power, self.analysis)
+            level = noise_level(self.noise, power, self.spectrogram)
             waveform = waveform + draw_noise(level, waveform.shape[-1], seed=seed)
         return waveform, self.analyse(waveform)
 
     def analyse(self, waveform: Floats) -> Floats:
         """Return the spectrogram (E, R, F) of a waveform (E, S) that starts at the emission."""
-        return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
+        return dechirped_spectrogram(waveform, self.spectrogram, self.speed_of_sound, self.delay)
 
     @cached_property
     def _stretch(self) -> int:
@@ -370,17 +373,17 @@ class Head(Shown):
     def _target_power(self) -> Floats:
         """Power (1,) of the target that the noise is relative to."""
         target = target_gain(self.noise.target_strength_db, self.noise.target_distance)
-        return loudest_power(target * self.waveform[None], self.analysis, self._stretch)
+        return loudest_power(target * self.waveform[None], self.spectrogram, self._stretch)
 
     def _check_band(self) -> None:
-        analysis = self.analysis
-        if covered(self.call, within_band(analysis)).any():
+        spectrogram = self.spectrogram
+        if covered(self.call, within_band(spectrogram)).any():
             return
         assert self.call.file is not None
         bands = load_call(self.call.file).bands
         held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
         raise InputError(
             f"{self.call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min"
-            f" to frequency_max ({analysis.frequency_min / 1e3:g} to "
-            f"{analysis.frequency_max / 1e3:g} kHz); change these, or take another call"
+            f" to frequency_max ({spectrogram.frequency_min / 1e3:g} to "
+            f"{spectrogram.frequency_max / 1e3:g} kHz); change these, or take another call"
         )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Match of call and analysis: the echo of a point in each row; and the noise of the ears.
+"""Match of call and filters: the echo of a point in each row; and the noise of the ears.
 
 Noise is white and Gaussian, set by a signal-to-noise ratio of powers within the analysis
-band, in the waveform as the ear receives it, before dechirp and analysis: the mean power of an echo
+band, in the waveform as the ear receives it, before dechirp and filters: the mean power of an echo
 over its loudest stretch, as long as the call lasts but at least one analysis window, to the noise's
 power. Whose echo, is a choice:
 
@@ -26,7 +26,7 @@ import scipy.fft
 from numpy.typing import ArrayLike
 
 from sononerf.head.call import call_waveform, covered, has_ghosts, sweep_delay, sweep_rate
-from sononerf.head.front_end import echo_samples, frequency_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, echo_samples, frequency_axis
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION, row_filters, row_widths
 from sononerf.numerics import Floats
 from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
@@ -49,26 +49,28 @@ def target_gain(target_strength_db: float, distance: float) -> float:
     return float(10.0 ** (target_strength_db / 20.0)) / distance**2
 
 
-def loudest_power(echo: Floats, analysis: SpectrogramSettings, samples: int) -> Floats:
+def loudest_power(echo: Floats, spectrogram: SpectrogramSettings, samples: int) -> Floats:
     """Mean power within the analysis band over an echo's loudest stretch.
 
     In: echo (E, S). Out: power (E,).
     """
     padded = np.pad(echo, ((0, 0), (samples, samples)))
     length = int(scipy.fft.next_fast_len(padded.shape[-1], real=True))
-    frequency = np.fft.rfftfreq(length, 1.0 / analysis.sampling_rate)
-    band = (frequency >= analysis.frequency_min) & (frequency <= analysis.frequency_max)
+    frequency = np.fft.rfftfreq(length, 1.0 / spectrogram.sampling_rate)
+    band = (frequency >= spectrogram.frequency_min) & (frequency <= spectrogram.frequency_max)
     heard = np.fft.irfft(np.fft.rfft(padded, length) * band, length)
     total = np.cumsum(heard**2, axis=-1)
     return (total[:, samples:] - total[:, :-samples]).max(axis=-1) / samples
 
 
-def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSettings) -> Floats:
+def noise_level(settings: NoiseSettings, power: Floats, spectrogram: SpectrogramSettings) -> Floats:
     """Set each ear's noise: the standard deviation of its samples.
 
     In: power (E,). Out: level (E,).
     """
-    share = 2.0 * (analysis.frequency_max - analysis.frequency_min) / analysis.sampling_rate
+    share = (
+        2.0 * (spectrogram.frequency_max - spectrogram.frequency_min) / spectrogram.sampling_rate
+    )
     ratio = 10.0 ** (np.asarray(settings.snr_db, dtype=np.float64) / 10.0)
     return np.sqrt(power / (ratio * share))
 
@@ -84,15 +86,17 @@ def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
 
 logger = logging.getLogger("sononerf")
 
-FAR = 2.0  # factor between a window and the best one that is worth a warning
-FAINT = 1e-2
+MAX_WINDOW_RATIO = 2.0  # factor between a window and the best one that is worth a warning
+MIN_ECHO = 1e-2
 """Magnitude, over that at its own range, down to which a point echo is followed over time."""
-MOST = 4.0
+MAX_OTHER_ECHO = 4.0
 """Largest magnitude of a point echo at another time, where another harmonic is, over that at its
 own range: 12 dB."""
 
 
-def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike) -> Floats:
+def row_duration(
+    call: CallSettings, spectrogram: SpectrogramSettings, frequency: ArrayLike
+) -> Floats:
     r"""Duration of a point echo in a row of the dechirped spectrogram.
 
     .. math:: \sqrt{T_w^2 + (B_w / |\dot f|)^2}
@@ -104,11 +108,11 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
 
     In: frequency ((F,), Hz). Out: duration ((F,), s).
     """
-    lasts, wide = row_widths(analysis, frequency)
+    lasts, wide = row_widths(spectrogram, frequency)
     return np.hypot(lasts, wide / sweep_rate(call, frequency))
 
 
-def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
+def best_window(call: CallSettings, spectrogram: SpectrogramSettings) -> int:
     """Length of the window that keeps a point echo shortest in the dechirped spectrogram.
 
     A short window is wide in frequency, so a slow sweep stays in it for long; a long window is long
@@ -120,100 +124,107 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
         >>> best_window(call, SpectrogramSettings(frequency_min=40e3))
         306
     """
-    if call.kind == "impulse" or analysis.kind == "gammatone":
-        return analysis.window
-    slowness = math.sqrt(np.mean(sweep_rate(call, _heard(call, analysis)) ** -2.0))
-    return round(analysis.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness))
+    if call.kind == "impulse" or spectrogram.kind == "gammatone":
+        return spectrogram.window
+    slowness = math.sqrt(np.mean(sweep_rate(call, _heard(call, spectrogram)) ** -2.0))
+    return round(
+        spectrogram.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness)
+    )
 
 
-def within_band(analysis: SpectrogramSettings) -> Floats:
+def within_band(spectrogram: SpectrogramSettings) -> Floats:
     """Return the rows' frequencies, the outermost moved to the ends of the wanted band."""
-    return np.clip(frequency_axis(analysis), analysis.frequency_min, analysis.frequency_max)
+    return np.clip(
+        frequency_axis(spectrogram), spectrogram.frequency_min, spectrogram.frequency_max
+    )
 
 
-def _heard(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
+def _heard(call: CallSettings, spectrogram: SpectrogramSettings) -> Floats:
     """Return those of the rows' frequencies that the call covers; all, where it covers none."""
-    frequency = within_band(analysis)
+    frequency = within_band(spectrogram)
     heard = covered(call, frequency)
     return frequency[heard] if heard.any() else frequency
 
 
-def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
+def effective_window(call: CallSettings, spectrogram: SpectrogramSettings) -> Floats:
     """Point echo in each row of the dechirped spectrogram, as a window over the received time.
 
     Out: window (F, W).
     """
-    frequency, filters = frequency_axis(analysis), row_filters(analysis)
+    frequency, filters = frequency_axis(spectrogram), row_filters(spectrogram)
     if call.kind == "impulse":
         return filters.point_echo()
-    if analysis.kind == "gammatone" or has_ghosts(call, frequency):
-        side = filters.envelope.shape[1] + call_waveform(call, analysis.sampling_rate).size
-        return _cropped(_point_echo(call, analysis, side), call, analysis)
-    length = analysis.window
-    slowest = float(sweep_rate(call, _heard(call, analysis)).min())
-    lobe = 2.0 * analysis.sampling_rate / length  # Hz, from the middle to the first zero
-    extra = math.ceil(lobe / slowest * analysis.sampling_rate)
-    row = _point_echo(call, analysis, extra + (length - 1) / 2.0)
+    if spectrogram.kind == "gammatone" or has_ghosts(call, frequency):
+        side = filters.envelope.shape[1] + call_waveform(call, spectrogram.sampling_rate).size
+        return _cropped(_point_echo(call, spectrogram, side), call, spectrogram)
+    length = spectrogram.window
+    slowest = float(sweep_rate(call, _heard(call, spectrogram)).min())
+    lobe = 2.0 * spectrogram.sampling_rate / length  # Hz, from the middle to the first zero
+    extra = math.ceil(lobe / slowest * spectrogram.sampling_rate)
+    row = _point_echo(call, spectrogram, extra + (length - 1) / 2.0)
     power = row**2 + row[:, ::-1] ** 2
     middle = power[:, (power.shape[1] - 1) // 2]
     return np.sqrt(power / middle[:, None])
 
 
-def _point_echo(call: CallSettings, analysis: SpectrogramSettings, side: float) -> Floats:
+def _point_echo(call: CallSettings, spectrogram: SpectrogramSettings, side: float) -> Floats:
     """Return a point's echo in each row, (F, W), as far as ``side`` samples to both sides."""
-    centre = row_filters(analysis).centre
+    centre = row_filters(spectrogram).centre
     side = math.ceil(side - centre % 1.0) + centre % 1.0
     count = round(2 * side) + 1
     # At a speed of 2 m/s ranges are seconds. Frame k is centred on sample k + centre.
-    last = (centre + count - 0.5) / analysis.sampling_rate
-    fine = analysis.model_copy(update={"hop": 1, "range_min": 0.0, "range_max": last})
-    waveform = call_waveform(call, analysis.sampling_rate)
-    delay = sweep_delay(call, frequency_axis(analysis))
+    last = (centre + count - 0.5) / spectrogram.sampling_rate
+    fine = spectrogram.model_copy(update={"hop": 1, "range_min": 0.0, "range_max": last})
+    waveform = call_waveform(call, spectrogram.sampling_rate)
+    delay = sweep_delay(call, frequency_axis(spectrogram))
     start = round(centre + side)
     samples = max(echo_samples(fine, 2.0, float(delay.max())), start + len(waveform))
     echo = np.zeros((1, samples))
     echo[0, start : start + len(waveform)] = waveform
-    return spectrogram(echo, fine, 2.0, delay)[0].T[:, :count]
+    return dechirped_spectrogram(echo, fine, 2.0, delay)[0].T[:, :count]
 
 
-def _cropped(row: Floats, call: CallSettings, analysis: SpectrogramSettings) -> Floats:
+def _cropped(row: Floats, call: CallSettings, spectrogram: SpectrogramSettings) -> Floats:
     """Return point echoes over their height at their own range, without faint columns."""
     width = row.shape[1]
     middle = row[:, [(width - 1) // 2, width // 2]].mean(axis=1)
     window = row / np.maximum(middle, 1e-12 * row.max())[:, None]
-    heard = covered(call, within_band(analysis))
+    heard = covered(call, within_band(spectrogram))
     if not heard.all() and heard.any():
         window[~heard] = np.minimum(window[~heard], 1.0)  # it has no middle of its own
-    window = np.minimum(window, MOST)
-    loud = np.flatnonzero((window[heard] if heard.any() else window).max(axis=0) >= FAINT)
+    window = np.minimum(window, MAX_OTHER_ECHO)
+    loud = np.flatnonzero((window[heard] if heard.any() else window).max(axis=0) >= MIN_ECHO)
     spare = min(int(loud[0]), width - 1 - int(loud[-1]))
     return window[:, spare : width - spare]
 
 
-def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
-    """Log one line for each way in which call and analysis do not suit one another."""
-    warn_of_band(call, analysis)
-    best = best_window(call, analysis)
-    if analysis.kind == "stft" and not 1.0 / FAR <= best / analysis.window <= FAR:
+def warn_of_call(call: CallSettings, spectrogram: SpectrogramSettings) -> None:
+    """Log one line for each way in which call and filters do not suit one another."""
+    warn_of_band(call, spectrogram)
+    best = best_window(call, spectrogram)
+    if (
+        spectrogram.kind == "stft"
+        and not 1.0 / MAX_WINDOW_RATIO <= best / spectrogram.window <= MAX_WINDOW_RATIO
+    ):
         here, there = (
-            1e6 * math.sqrt(np.mean(row_duration(call, chosen, _heard(call, analysis)) ** 2))
-            for chosen in (analysis, analysis.model_copy(update={"window": best}))
+            1e6 * math.sqrt(np.mean(row_duration(call, chosen, _heard(call, spectrogram)) ** 2))
+            for chosen in (spectrogram, spectrogram.model_copy(update={"window": best}))
         )
         longer_fft = f" and spectrogram.fft={2 ** math.ceil(math.log2(best))}"
         logger.warning(
             "a point echo lasts %.0f µs in a window of %d samples and %.0f µs in the one that "
             "suits this call best; set spectrogram.window=%d%s",
             here,
-            analysis.window,
+            spectrogram.window,
             there,
             best,
-            longer_fft if best > analysis.fft else "",
+            longer_fft if best > spectrogram.fft else "",
         )
 
 
-def warn_of_band(call: CallSettings, analysis: SpectrogramSettings) -> None:
+def warn_of_band(call: CallSettings, spectrogram: SpectrogramSettings) -> None:
     """Log one line if a call does not cover the analysed band."""
-    frequency = within_band(analysis)
+    frequency = within_band(spectrogram)
     silent = ~covered(call, frequency)
     if silent.any():
         edges = np.flatnonzero(np.diff(silent, prepend=False, append=False)).reshape(-1, 2)

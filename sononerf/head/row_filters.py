@@ -60,7 +60,7 @@ range."""
 
 @dataclass(frozen=True, eq=False)
 class RowFilters:
-    """The filters of an analysis."""
+    """The filters of a spectrogram."""
 
     frequency: Floats  # (F,), Hz: Frequencies of the rows, ascending
     envelope: Floats  # (F, W): Over the samples that a frame reads, 1 at its greatest or almost
@@ -139,14 +139,14 @@ def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Flo
 
 @lru_cache(maxsize=16)  # all readers of rows share the arrays; nobody may write to them
 def row_filters(settings: SpectrogramSettings) -> RowFilters:
-    """Return the filters of an analysis."""
+    """Return the filters of a spectrogram."""
     return _gammatone(settings) if settings.kind == "gammatone" else _hamming(settings)
 
 
 def _hamming(settings: SpectrogramSettings) -> RowFilters:
     frequency, rate = row_frequencies(settings), settings.sampling_rate
     window = np.hamming(settings.window)
-    reach = WINDOW_LOBE * rate / settings.window
+    margin = WINDOW_LOBE * rate / settings.window
     envelope = np.broadcast_to(window, (len(frequency), len(window)))
     return RowFilters(
         frequency=frequency,
@@ -154,7 +154,7 @@ def _hamming(settings: SpectrogramSettings) -> RowFilters:
         origin=0,
         centre=(settings.window - 1) / 2.0,
         length=settings.window,
-        band=(float(frequency[0]) - reach, float(frequency[-1]) + reach),
+        band=(float(frequency[0]) - margin, float(frequency[-1]) + margin),
         looks=_looks(envelope, frequency, rate),
     )
 

@@ -31,26 +31,26 @@ import numpy as np
 from sononerf.geometry.poses import Poses, off_axis
 from sononerf.numerics import Floats, Ints
 from sononerf.recordings.pose_tables import EULER, PLACE, QUATERNION, Columns, to_poses
-from sononerf.recordings.ranges import Prediction, predict
+from sononerf.recordings.ranges import RangePrediction, predict_ranges
 from sononerf.settings.sections import ImportSettings
 
-FEWEST = 12
+MIN_PINGS = 12
 """Number of pings below which nothing can be tested."""
-MOST = 400
+MAX_PINGS = 400
 """Number of pings, at most, that are tested, evenly over all."""
-CLEARLY = 0.15
+MIN_GAIN_PER_PING = 0.15
 """Least gain in log-likelihood per ping for another convention to be named."""
-AT_LEAST = 12.0
+MIN_GAIN = 12.0
 """Least gain in log-likelihood of all pings: odds of e^12."""
-EQUAL = 0.95
+EQUAL_GAIN = 0.95
 """Gain over that of the best convention from which another convention is named beside it."""
-FAR_APART, CLOSE = 100.0, 0.01
+MAX_POSE_SPREAD, MIN_POSE_SPREAD = 100.0, 0.01
 """Spread of the poses over the median range beyond which a unit is wrong, no unit. A flight of a
 hundred metres past things one metre away is still right."""
-CONTRADICTS = 1.0
+MAX_RANGE_ERROR = 1.0
 """A first echo contradicts the others if its range differs by more than this from the range that
 they predict, in range resolutions. Sound sets differ by 0.1 to 0.6 in the median."""
-SHUFFLED = 0.6
+MIN_ORDER_GAIN = 0.6
 """A table counts as shuffled if its gain over random orders of the poses is below this, in
 log-likelihood per ping. The largest gain of 40 shuffled sets was 0.33; right poses gain 2 or
 more."""
@@ -58,15 +58,15 @@ MOST_CHANNELS = 8
 """Number of channels, at most, that are swapped in pairs: 28 pairs take some seconds."""
 RANGE_FACTORS = tuple(float(f) for f in np.exp(np.linspace(-0.6, 0.6, 13)) if abs(f - 1.0) > 0.01)
 """Factors of all ranges, 10 % apart: those of a wrong sampling rate or speed of sound."""
-RANGES_CLEARLY = 0.5
-"""CLEARLY for such a factor: of 120 sound sets two gained 0.3, and the others less."""
-ORDERS = 4
+MIN_SCALE_GAIN = 0.5
+"""MIN_GAIN_PER_PING for such a factor: of 120 sound sets two gained 0.3, and the others less."""
+RANDOM_ORDERS = 4
 """Number of random orders that the stated order of the poses is compared with."""
 XYZW = (QUATERNION[-1], *QUATERNION[:-1])
 """Columns that hold w, x, y, z if numbers in the order x, y, z, w have the names w, x, y, z."""
 AIM_FLOOR = np.radians(20.0)
 """Angle between aim and body below which all heads count as aiming equally well, rad."""
-AROUND = 0.15
+MIN_DIRECTION_SPREAD = 0.15
 """Least fraction of the directions' variance along their weakest axis from which poses count as all
 around."""
 
@@ -88,9 +88,9 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
     if settings.turntable is not None:
         table = settings.turntable
         other = "counterclockwise" if table.turns == "clockwise" else "clockwise"
-        turned = table.model_copy(update={"turns": other})
+        reversed_table = table.model_copy(update={"turns": other})
         readings["reversed turntable"] = to_poses(
-            columns, settings.model_copy(update={"turntable": turned})
+            columns, settings.model_copy(update={"turntable": reversed_table})
         )
         for name, factor in _angle_factors(columns, "angle"):
             readings[name] = to_poses(_scaled(columns, ("angle",), factor), settings)
@@ -177,9 +177,9 @@ def check_poses(
     In: first ((P, E), m), emitter ((3,), m), receivers ((E, 3), m), resolution (m).
     """
     heard = np.flatnonzero(np.isfinite(first).any(axis=1))
-    if len(heard) < FEWEST:
+    if len(heard) < MIN_PINGS:
         return Verdict()
-    sampled = heard[np.linspace(0, len(heard) - 1, min(MOST, len(heard))).round().astype(int)]
+    sampled = heard[np.linspace(0, len(heard) - 1, min(MAX_PINGS, len(heard))).round().astype(int)]
     sampled = np.unique(sampled)
     ranges = np.where(np.isfinite(first[sampled]), first[sampled], np.nan)
     unit = _unit(stated[sampled], ranges)
@@ -201,18 +201,18 @@ def check_poses(
         name = f"channels {one} and {other} swapped"
         # Two ears that are swapped hear as a left-handed frame does; that is named first.
         found = head.misfit(stated[sampled], ranges[:, swapped])
-        gains[name] = EQUAL * (own.total - found.total)
+        gains[name] = EQUAL_GAIN * (own.total - found.total)
     best = max(gains, key=gains.__getitem__, default="")
-    enough = max(AT_LEAST, CLEARLY * len(sampled))
+    enough = max(MIN_GAIN, MIN_GAIN_PER_PING * len(sampled))
     order = _order(head, stated[sampled], ranges, own)
     better = order.gain + max(gains.get(best, 0.0), 0.0)
-    if order.name and better < SHUFFLED * len(sampled):
+    if order.name and better < MIN_ORDER_GAIN * len(sampled):
         return order
     if scaled.name and scaled.gain > gains.get(best, 0.0):
         return scaled
     if not best or gains[best] < enough:
         return Verdict()
-    equal = [name for name in gains if name != best and gains[name] >= EQUAL * gains[best]]
+    equal = [name for name in gains if name != best and gains[name] >= EQUAL_GAIN * gains[best]]
     turns = _turns(stated)
     named = [
         "reversed turntable" if turns and name == "left-handed frame" else name
@@ -221,7 +221,7 @@ def check_poses(
     return Verdict(named[0], _message(named), gains[best])
 
 
-def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verdict:
+def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: PoseMisfit) -> Verdict:
     """Return whether all ranges times a factor fit the poses clearly better.
 
     Poses at one distance from the body fit ranges of any scale.
@@ -234,7 +234,7 @@ def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: Misfit)
         )
         gains[factor] = own.total - found.total + found.count * math.log(factor)
     best = max(gains, key=gains.__getitem__)
-    if gains[best] < RANGES_CLEARLY * len(poses):
+    if gains[best] < MIN_SCALE_GAIN * len(poses):
         return Verdict()
     return Verdict(
         "scale of ranges",
@@ -244,7 +244,7 @@ def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: Misfit)
     )
 
 
-def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verdict:
+def _order(head: Consistency, poses: Poses, ranges: Floats, own: PoseMisfit) -> Verdict:
     """Return the gain of the stated order of the poses over random orders.
 
     The verdict is empty if few echoes contradict the others, because then the order is right, or
@@ -252,12 +252,12 @@ def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verd
     """
     error = np.abs(own.prediction.residual)
     known = np.isfinite(error).any(axis=1)
-    count = int((np.nanmean(error[known], axis=1) > CONTRADICTS * head.resolution).sum())
+    count = int((np.nanmean(error[known], axis=1) > MAX_RANGE_ERROR * head.resolution).sum())
     if 2 * count < len(poses):
         return Verdict()
     rng = np.random.default_rng(0)
-    turned = [poses[rng.permutation(len(poses))] for _ in range(ORDERS)]
-    gain = float(np.mean([head.misfit(one, ranges).total for one in turned])) - own.total
+    shuffled = [poses[rng.permutation(len(poses))] for _ in range(RANDOM_ORDERS)]
+    gain = float(np.mean([head.misfit(one, ranges).total for one in shuffled])) - own.total
     return Verdict(
         "shuffled table",
         f"{count} of {len(poses)} first echoes contradict the others, and the poses in random "
@@ -267,12 +267,12 @@ def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verd
 
 
 @dataclass(frozen=True, eq=False)
-class Misfit:
+class PoseMisfit:
     """Misfit between poses and first echoes."""
 
     total: float  # Sum of the logarithms of the scales of errors; less is better
     count: float  # Number of errors in the sum
-    prediction: Prediction  # Prediction of each ping by the others
+    prediction: RangePrediction  # Prediction of each ping by the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,12 +283,12 @@ class Consistency:
     receivers: Floats  # (E, 3), m: Head frame
     resolution: float  # m: Range resolution
 
-    def misfit(self, poses: Poses, first: Floats) -> Misfit:
+    def misfit(self, poses: Poses, first: Floats) -> PoseMisfit:
         """Return the sum of logarithms of error scales of pings (P, E)."""
         out = poses.positions + poses.rotations @ self.emitter
         back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, self.receivers)
         middle = (out[:, None] + back) / 2.0
-        prediction = predict(middle, back - out[:, None], first)
+        prediction = predict_ranges(middle, back - out[:, None], first)
         floor = 0.1 * self.resolution
         both = np.isfinite(prediction.residual).sum(axis=1) > 1
         common = np.nanmean(
@@ -306,7 +306,7 @@ class Consistency:
         if self._hears_direction():
             angle = off_axis(poses, prediction.centre)
             total += len(angle) * np.log(max(float(np.median(angle)), AIM_FLOOR))
-        return Misfit(float(total), count, prediction)
+        return PoseMisfit(float(total), count, prediction)
 
     def _hears_direction(self) -> bool:
         """Return whether it matters which way the head looks."""
@@ -323,14 +323,14 @@ def _unit(poses: Poses, ranges: Floats) -> Verdict:
     spread = float(
         np.sqrt(np.square(poses.positions - poses.positions.mean(axis=0)).sum(axis=1).mean())
     )
-    reach = float(np.nanmedian(ranges))
+    usual_range = float(np.nanmedian(ranges))
     said = (
         f"poses lie {_length(spread)} from their mean, and their first echoes come from "
-        f"{_length(reach)}"
+        f"{_length(usual_range)}"
     )
-    if spread > FAR_APART * reach:
+    if spread > MAX_POSE_SPREAD * usual_range:
         return Verdict("millimetres for metres", f"{said}: are the lengths in mm?", np.inf)
-    if 0.0 < spread < CLOSE * reach:
+    if 0.0 < spread < MIN_POSE_SPREAD * usual_range:
         return Verdict("metres for millimetres", f"{said}: are the lengths in m?", np.inf)
     return Verdict()
 
@@ -339,12 +339,12 @@ def _length(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 0.01 else f"{1000 * metres:.3g} mm"
 
 
-def _late(poses: Poses, prediction: Prediction, resolution: float) -> Verdict:
+def _late(poses: Poses, prediction: RangePrediction, resolution: float) -> Verdict:
     """Return whether the ranges are too long for any body amid the poses."""
     away = poses.positions - prediction.centre
     distance = np.linalg.norm(away, axis=1)
     direction = away / np.maximum(distance, 1e-12)[:, None]
-    if np.linalg.eigvalsh(direction.T @ direction / len(direction))[0] < AROUND:
+    if np.linalg.eigvalsh(direction.T @ direction / len(direction))[0] < MIN_DIRECTION_SPREAD:
         return Verdict()
     error = np.abs(prediction.residual[np.isfinite(prediction.residual)])
     slack = resolution + (2.0 * float(np.median(error)) if len(error) else 0.0)

@@ -96,7 +96,7 @@ def columns_of(
     for full, column in given.items():
         name, unit = _parted(where, full)
         if name in values:
-            raise InputError(f"{where}: column {name} stands twice; leave one of them out")
+            raise InputError(f"{where}: duplicate column {name}; leave one of them out")
         kind = KINDS[name]
         if kind in ("length", "angle"):
             stated = getattr(settings, kind)

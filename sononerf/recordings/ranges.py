@@ -30,12 +30,12 @@ from sononerf.echoes.region import echo_extent
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, covered, sweep_delay
 from sononerf.head.ears import beam_gain, ear_gain
-from sononerf.head.front_end import frequency_axis, range_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, frequency_axis, range_axis
 from sononerf.head.head import Head
 from sononerf.numerics import Floats
 from sononerf.progress import Progress
 from sononerf.recordings.readers import read_sound
-from sononerf.recordings.recording import Cutter, Recording, cut, mix
+from sononerf.recordings.recording import Cutter, Recording, cut, mixed_channels
 from sononerf.resources import require_memory
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 from sononerf.settings.sections import ImportSettings, ReferenceSettings
@@ -53,7 +53,7 @@ RIDGE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class RangePrediction:
     """First echoes of the pings as predicted from one another.
 
     Attributes:
@@ -68,7 +68,7 @@ class Prediction:
     size: float
 
 
-def predict(middle: Floats, separation: Floats, first: Floats) -> Prediction:
+def predict_ranges(middle: Floats, separation: Floats, first: Floats) -> RangePrediction:
     """Predict each ping's first echoes from the other pings'.
 
     Args:
@@ -100,7 +100,7 @@ def predict(middle: Floats, separation: Floats, first: Floats) -> Prediction:
         weights = _robust(basis[rest][there], target[rest][there])
         residual[own] = basis[own] @ weights - target[own]
     residual[~np.isfinite(first)] = np.nan
-    return Prediction(residual, centre, size)
+    return RangePrediction(residual, centre, size)
 
 
 def _powers(degree: int) -> list[tuple[int, ...]]:
@@ -168,19 +168,21 @@ def _sides(places: Floats, start: Floats, scale: float) -> list[Floats]:
     return [start, start + scale * normal, start - scale * normal]
 
 
-SEARCH = 0.25
+SEARCH_FRACTION = 0.25
 """Half width of the search for the sphere's echo, as a fraction of the sphere's distance."""
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class SphereCalibration:
     """Calibration from the echo of the reference target."""
 
     gain: Floats  # (E,): Factor that brings each receiver to the call's pressure at 1 m
     range_offset: float  # m: To be added to every range
 
 
-def calibrate(echo: Floats, reference: ReferenceSettings, head: Head) -> Calibration:
+def calibrate_recording(
+    echo: Floats, reference: ReferenceSettings, head: Head
+) -> SphereCalibration:
     r"""Compare the echo of a reference target with theory.
 
     A rigid sphere of radius a, large against the wavelength, sends back a/2 of the pressure that
@@ -198,18 +200,18 @@ def calibrate(echo: Floats, reference: ReferenceSettings, head: Head) -> Calibra
     """
     ears, call, speed_of_sound = head.gains, head.call, head.speed_of_sound
     absorption = head.absorption(head.frequency)
-    near = head.analysis.model_copy(
+    near = head.spectrogram.model_copy(
         update={
             "hop": 1,
-            "range_min": reference.distance * (1.0 - SEARCH),
-            "range_max": reference.distance * (1.0 + SEARCH),
+            "range_min": reference.distance * (1.0 - SEARCH_FRACTION),
+            "range_max": reference.distance * (1.0 + SEARCH_FRACTION),
         }
     )
     frequency = frequency_axis(near)
     delay = sweep_delay(call, frequency)
     axis = range_axis(near, speed_of_sound)
     try:
-        heard = spectrogram(echo, near, speed_of_sound, delay)
+        heard = dechirped_spectrogram(echo, near, speed_of_sound, delay)
     except ValueError as error:
         raise InputError(f"import.reference: {error}") from None
     swept = covered(call, frequency)
@@ -218,8 +220,9 @@ def calibrate(echo: Floats, reference: ReferenceSettings, head: Head) -> Calibra
     top = power.argmax(axis=1)
     if not (power.max(axis=1) > 0.0).all() or (top == 0).any() or (top == len(axis) - 1).any():
         raise InputError(
-            f"{reference.file}: no echo of the reference target within {100 * SEARCH:.0f} % of "
-            f"{reference.distance:g} m; check import.reference.distance and time"
+            f"{reference.file}: no echo of the reference target within "
+            f"{100 * SEARCH_FRACTION:.0f} % of {reference.distance:g} m; check "
+            "import.reference.distance and time"
         )
     centre = ears.emitter + np.array([reference.distance + reference.radius, 0.0, 0.0])
     to_emitter = centre - ears.emitter
@@ -243,20 +246,20 @@ def calibrate(echo: Floats, reference: ReferenceSettings, head: Head) -> Calibra
     profile = np.square(direct * expected[:, None])[..., swept].mean(axis=-1)
     bias = speed_of_sound / 2.0 * _peak(time, profile, profile.argmax(axis=1))
     offsets = path + bias - _peak(axis, power, top)
-    return Calibration(np.sqrt(model / measured), float(offsets.mean()))
+    return SphereCalibration(np.sqrt(model / measured), float(offsets.mean()))
 
 
 def _call_itself(
-    call: CallSettings, analysis: SpectrogramSettings, delay: Floats
+    call: CallSettings, spectrogram: SpectrogramSettings, delay: Floats
 ) -> tuple[Floats, Floats]:
     """Return the dechirped spectrogram (T, F) of the call, and its times (T,) s."""
-    waveform, rate = call_waveform(call, analysis.sampling_rate), analysis.sampling_rate
-    lead = len(waveform) + 2 * analysis.window
+    waveform, rate = call_waveform(call, spectrogram.sampling_rate), spectrogram.sampling_rate
+    lead = len(waveform) + 2 * spectrogram.window
     # At a speed of 2 m/s ranges are seconds.
-    own = analysis.model_copy(update={"range_min": 1e-12, "range_max": 2 * lead / rate})
-    echo = np.zeros((1, 4 * lead + analysis.window + int(delay.max() * rate)))
+    own = spectrogram.model_copy(update={"range_min": 1e-12, "range_max": 2 * lead / rate})
+    echo = np.zeros((1, 4 * lead + spectrogram.window + int(delay.max() * rate)))
     echo[0, lead : lead + len(waveform)] = waveform
-    return range_axis(own, 2.0) - lead / rate, spectrogram(echo, own, 2.0, delay)[0]
+    return range_axis(own, 2.0) - lead / rate, dechirped_spectrogram(echo, own, 2.0, delay)[0]
 
 
 def _peak(axis: Floats, power: Floats, top: NDArray[np.intp]) -> Floats:
@@ -270,43 +273,43 @@ def _peak(axis: Floats, power: Floats, top: NDArray[np.intp]) -> Floats:
 
 INAUDIBLE_DB = 140.0
 """Two-way absorption beyond which no echo is sought, dB: 24 bits record 144 dB."""
-SHORT = 0.1
+MAX_SHORT_FRACTION = 0.1
 """Largest fraction of the pings that may be shorter than the analysed range; they are named if
 echoes of the others come later."""
-ASKED = 64
+MAX_PINGS = 64
 """Number of pings, evenly over all, that determine ranges and noise."""
 
 
 def analysis_bytes(head: Head, pings: int) -> float:
     """Return the memory of an analysis, bytes: frames of one ping, and copies of all powers."""
-    frame = head.analysis.window + 4 * len(head.frequency)
+    frame = head.spectrogram.window + 4 * len(head.frequency)
     return 8.0 * len(head.receivers) * len(head.range) * (frame + 6 * min(pings, MOST_POSES))
 
 
-def found_ranges(
+def range_limits(
     head: Head, cutter: Cutter, recording: Recording, given: Collection[str], progress: Progress
 ) -> tuple[dict[str, float], Floats]:
     """Find range limits that are left out from the echoes.
 
     Out: power (P, E, R).
     """
-    analysis, speed = head.analysis, head.speed_of_sound
-    rate = analysis.sampling_rate
+    spectrogram, speed = head.spectrogram, head.speed_of_sound
+    rate = spectrogram.sampling_rate
     lengths = np.array([cutter.samples(index) for index in range(len(recording))])
-    count = int(np.quantile(lengths, SHORT, method="lower"))
+    count = int(np.quantile(lengths, MAX_SHORT_FRACTION, method="lower"))
     begins = max(cutter.begins(index) for index in range(len(recording)))
     metre = speed / 2.0 / rate  # of a sample
     longest = float(head.delay.max())
     loss = 2.0 * float(head.absorption(head.frequency).min())  # dB/m, there and back
     audible = INAUDIBLE_DB / loss if loss > 0.0 else math.inf
-    whole = min(_widest(analysis.window, count, longest * rate, metre), audible)
+    whole = min(_widest(spectrogram.window, count, longest * rate, metre), audible)
     apart = np.linalg.norm(head.receivers - head.emitter, axis=1)
     # The call itself comes first, smeared by a window.
-    dead = float(apart.max()) / 2.0 + 2.0 * analysis.window * metre
-    first = max(dead, (begins + analysis.window / 2.0) * metre)
-    low = analysis.range_min if "range_min" in given else first
-    high = analysis.range_max if "range_max" in given else whole
-    if low < (begins + (analysis.window - 1) / 2.0) * metre - metre:
+    dead = float(apart.max()) / 2.0 + 2.0 * spectrogram.window * metre
+    first = max(dead, (begins + spectrogram.window / 2.0) * metre)
+    low = spectrogram.range_min if "range_min" in given else first
+    high = spectrogram.range_max if "range_max" in given else whole
+    if low < (begins + (spectrogram.window - 1) / 2.0) * metre - metre:
         raise InputError(
             f"{recording.path}: a recording begins after spectrogram.range_min ({low:g} m); raise "
             "it, or leave it out"
@@ -319,14 +322,16 @@ def found_ranges(
             "time and its unit"
         )
     chosen = {"range_min": low, "range_max": high}
-    wide = dataclasses.replace(head, analysis=analysis.model_copy(update=chosen))
+    wide = dataclasses.replace(head, spectrogram=spectrogram.model_copy(update=chosen))
     if wide.samples > count:
         raise InputError(
             f"{recording.path}: the recordings end {whole:.4g} m after the emission, before "
             f"spectrogram.range_max ({high:g} m); lower it, or leave it out"
         )
     long_enough = np.flatnonzero(lengths >= count)
-    asked = np.linspace(0, len(long_enough) - 1, min(ASKED, len(long_enough))).round().astype(int)
+    asked = (
+        np.linspace(0, len(long_enough) - 1, min(MAX_PINGS, len(long_enough))).round().astype(int)
+    )
     pings = long_enough[np.unique(asked)]
     require_memory(
         analysis_bytes(wide, len(pings)),
@@ -379,7 +384,9 @@ def calibrated(
         if cutter.background is not None:
             size = min(echo.shape[1], cutter.background.shape[1])
             echo[:, :size] -= cutter.background[:, :size]
-        calibration = calibrate(mix(echo, settings.channels) * settings.scale, target, head)
+        calibration = calibrate_recording(
+            mixed_channels(echo, settings.channels) * settings.scale, target, head
+        )
         delay -= 2.0 * calibration.range_offset / speed
         cutter = replace(cutter, delay=delay, gain=settings.scale * calibration.gain)
         if cutter.background is not None:

@@ -282,8 +282,8 @@ def read_airsas(path: Path, settings: ImportSettings) -> Recording:
         raise InputError(f"{path}: channels differ in length")
     values = dict(zip(PLACE, places.T, strict=True))
     if settings.look_at is None and settings.turntable is None:
-        turned = np.full(len(places), ACROSS)
-        values |= {"yaw": turned, "pitch": 0.0 * turned, "roll": 0.0 * turned}
+        yaw = np.full(len(places), ACROSS)
+        values |= {"yaw": yaw, "pitch": 0.0 * yaw, "roll": 0.0 * yaw}
     air: dict[str, Any] = {}
     if temperature is not None and temperature.size and np.isfinite(temperature).all():
         air = {"air": {"temperature_c": round(float(np.mean(temperature)), 3)}}

@@ -139,7 +139,7 @@ class Recording:
         return len(self.labels)
 
 
-DEAF = 0.35
+MIN_HEARD_FRACTION = 0.35
 """A channel counts as deaf if it heard echoes in less than this fraction of the pings in which
 another channel heard one, no unit. Receivers beside one another hear the same body, and noise that
 was pulse-compressed gives a false echo in up to a quarter of the pings."""
@@ -159,7 +159,7 @@ class Channel:
     level_db: float
     noise_db: float  # dB: The quietest tenth of its ranges over its own loudest echo; the median
     heard: int  # In how many pings it heard an echo
-    asked: int  # Number of pings that were checked
+    checked: int  # Number of pings that were checked
 
 
 def channels_of(power: Floats, looks: float) -> list[Channel]:
@@ -184,9 +184,9 @@ def faults_of_channels(channels: list[Channel]) -> list[str]:
     most = max(channel.heard for channel in channels)
     faults = []
     for number, channel in enumerate(channels):
-        if channel.heard < DEAF * most:
+        if channel.heard < MIN_HEARD_FRACTION * most:
             faults.append(
-                f"channel {number} heard echoes in {channel.heard} of {channel.asked} pings, and "
+                f"channel {number} heard echoes in {channel.heard} of {channel.checked} pings, and "
                 f"another one in {most}: is its microphone connected? Leave it out with "
                 "import.channels and ears.receivers"
             )
@@ -200,10 +200,10 @@ def faults_of_channels(channels: list[Channel]) -> list[str]:
 
 def check_channels(recording: Recording, channels: Channels | None) -> None:
     """Refuse a channel that is silent, or equal to another one, in all pings that are looked at."""
-    asked = np.linspace(0, len(recording) - 1, min(LOOKED_AT, len(recording))).round().astype(int)
+    checked = np.linspace(0, len(recording) - 1, min(LOOKED_AT, len(recording))).round().astype(int)
     contents = []
-    for ping in np.unique(asked).tolist():
-        samples = mix(np.asarray(recording.read(ping)), channels)
+    for ping in np.unique(checked).tolist():
+        samples = mixed_channels(np.asarray(recording.read(ping)), channels)
         constant = (samples == samples[:, :1]).all(axis=1)
         contents.append(
             [b"" if flat else row.tobytes() for flat, row in zip(constant, samples, strict=True)]
@@ -225,13 +225,13 @@ def check_channels(recording: Recording, channels: Channels | None) -> None:
             )
 
 
-GUARD = 64
+GUARD_SAMPLES = 64
 """Number of samples on both sides of a cut that take up the leakage of a shift by part of a
 sample."""
-STAYS = 3
+CLIPPED_SAMPLES = 3
 """Number of samples with the same greatest value as a neighbour from which a wave counts as
 clipped."""
-STEPS = 1000
+MIN_CLIPPED_STEPS = 1000
 """Least height of a clipped wave over its quantisation step: a fainter wave repeats values
 anyway."""
 
@@ -245,7 +245,7 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
     part = emission - whole
     if part > 1.0 - 1e-6:
         whole, part = whole + 1, 0.0
-    guard = GUARD if part > 1e-6 else 0
+    guard = GUARD_SAMPLES if part > 1e-6 else 0
     begin = whole + first - guard
     length = count + 2 * guard
     low, high = max(begin, 0), min(begin + length, samples.shape[1])
@@ -259,7 +259,7 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
     return np.fft.irfft(spectrum, size)[:, guard : guard + count]
 
 
-def mix(samples: NDArray[Any], channels: Channels | None) -> NDArray[Any]:
+def mixed_channels(samples: NDArray[Any], channels: Channels | None) -> NDArray[Any]:
     """Return the chosen channels (E, S); those that stand together are averaged."""
     if channels is None:
         return samples
@@ -277,7 +277,7 @@ class Cutter:
     """Cuts pings out of a recording."""
 
     recording: Recording  # All pings
-    channels: Channels | None = None  # Channels that become receivers; see :func:`mix`
+    channels: Channels | None = None  # Channels that become receivers; see :func:`mixed_channels`
     delay: float = 0.0  # s: Added to the time of every emission
     gain: ArrayLike = 1.0  # (E,): Factor of each receiver
     # (E, S) or None: Echoes of the surroundings alone, from the emission on, before the factors
@@ -314,7 +314,7 @@ class Cutter:
         if self.background is not None:
             there = self.background[:, first : first + whole]
             raw[:, : there.shape[1]] -= there
-        echo = mix(raw, self.channels) * np.reshape(self.gain, (-1, 1))
+        echo = mixed_channels(raw, self.channels) * np.reshape(self.gain, (-1, 1))
         return echo if self.call is None else inverse_filter(echo, self.call)[:, :count]
 
     @property
@@ -336,7 +336,7 @@ class Cutter:
         for index in range(len(self.recording)):
             samples = self.recording.read(index)
             begin = int(np.floor(self._emission(index)))
-            end = begin + last + self._tail + GUARD
+            end = begin + last + self._tail + GUARD_SAMPLES
             part = np.asarray(samples[:, max(begin, 0) : max(end, 0)])
             digest.update(np.ascontiguousarray(part).astype(part.dtype.newbyteorder("<")).tobytes())
         return digest.digest()
@@ -374,9 +374,9 @@ def clipped_pings(clippings: list[Clipping]) -> Bools:
     stays = np.stack([each.stays for each in clippings])
     step = clippings[0].step
     limit = peak.max(axis=0)
-    loud = (peak >= limit - 1.5 * step) & (limit > max(STEPS * step, 0.0))
+    loud = (peak >= limit - 1.5 * step) & (limit > max(MIN_CLIPPED_STEPS * step, 0.0))
     full = (peak >= 1.0 - 1.5 * step) if step else np.zeros_like(loud)
-    return np.asarray(((stays >= STAYS) & (loud | full)).any(axis=1))
+    return np.asarray(((stays >= CLIPPED_SAMPLES) & (loud | full)).any(axis=1))
 
 
 def check_numbers(recording: Recording, cutter: Cutter, last: int) -> None:

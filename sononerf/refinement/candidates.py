@@ -15,12 +15,12 @@ from torch import Tensor
 from sononerf.echoes.free_space import EchoHull
 from sononerf.numerics import Floats
 from sononerf.refinement.descent import STAGES, Stage
-from sononerf.refinement.objective import Level
+from sononerf.refinement.objective import ErrorLevel
 from sononerf.refinement.remesh import distance_from
 from sononerf.start.read_out import LEVELS, StartMethod
 from sononerf.start.surface import judge_openness
 
-TOLERATED = 1.15
+CHANCE_RATIO = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
 a sheet goes on after the first stage, or else one way before another. A refined surface is
 preferred to its start within it: a start that was made from the onsets fits them even where it is
@@ -29,17 +29,17 @@ RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
 are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
 too (``docs/notes/surface.md``). So above it a torn surface loses against its start. A closed
-candidate wins against one that is not closed. Within ``TOLERATED``, ``levels`` is preferred to the
-other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
-earliest one within ``TOLERATED`` of the best is kept."""
-ALIKE = 1 / 16
+candidate wins against one that is not closed. Within ``CHANCE_RATIO``, ``levels`` is preferred to
+the other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
+earliest one within ``CHANCE_RATIO`` of the best is kept."""
+SAME_SURFACE_DISTANCE = 1 / 16
 """Mean distance below which two surfaces sound alike, shortest wavelengths: the way there and back
 counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
-LATER = 1.03
+LATER_STAGE_RATIO = 1.03
 """Ratio of two objectives of one candidate below which the later stage is preferred: on smooth
 bodies later stages are nearer to the truth at the same objective. Edges lose in later stages, and
 there the objective rises by 5 % and more (beaker, star)."""
-Way = Literal["blurred", "sharp", "sheet", "planes"]
+Schedule = Literal["blurred", "sharp", "sheet", "planes"]
 """Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
 unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``sheet``:
 its triangles are kept, because a signed distance on voxels would tear it. ``planes``: its flat
@@ -50,9 +50,9 @@ parts move as planes, and are found anew in each stage."""
 class Candidate:
     """A start that goes through the stages in one way."""
 
-    way: Way  # The way
+    schedule: Schedule  # The way
     start: StartMethod  # Name of the start
-    level: Level  # Its gains and errors
+    level: ErrorLevel  # Its gains and errors
     meshes: list[trimesh.Trimesh]  # The start, and the surface after each stage so far, m
     # Objectives of these on the validation poses; NaN for a start that was not compared
     objectives: list[float]
@@ -76,11 +76,11 @@ class Candidate:
             for number, one in enumerate(refined, 1)
         ]
         least = min(refined, default=math.inf)
-        if math.isinf(least) or least > TOLERATED * start:
+        if math.isinf(least) or least > CHANCE_RATIO * start:
             return 0
-        if self.start == "levels" and self.way != "planes" and least > RANKS_DB:
-            return next(n for n, one in enumerate([start, *refined]) if one <= TOLERATED * least)
-        return max(n for n, found in enumerate(refined, 1) if found <= LATER * least)
+        if self.start == "levels" and self.schedule != "planes" and least > RANKS_DB:
+            return next(n for n, one in enumerate([start, *refined]) if one <= CHANCE_RATIO * least)
+        return max(n for n, found in enumerate(refined, 1) if found <= LATER_STAGE_RATIO * least)
 
     @property
     def objective(self) -> float:
@@ -104,35 +104,35 @@ def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 
 def planned(
     starts: Mapping[StartMethod, float], *, flat: bool = False
-) -> list[tuple[StartMethod, Way]]:
+) -> list[tuple[StartMethod, Schedule]]:
     """Return the start and the way of each candidate."""
     others = [name for name in starts if name not in (*LEVELS, "sheet")]
     chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
     chosen += sorted(others, key=lambda name: starts[name])[:1]
-    starts_and_ways: list[tuple[StartMethod, Way]] = []
+    pairs: list[tuple[StartMethod, Schedule]] = []
     for name in chosen:
         if not flat and (name != "levels" or "fuller" not in starts):
-            starts_and_ways.append((name, "blurred"))
-        starts_and_ways.append((name, "sharp"))
-    starts_and_ways += [("sheet", "sheet")] if "sheet" in starts else []
-    return [("levels", "planes"), *starts_and_ways] if flat else starts_and_ways
+            pairs.append((name, "blurred"))
+        pairs.append((name, "sharp"))
+    pairs += [("sheet", "sheet")] if "sheet" in starts else []
+    return [("levels", "planes"), *pairs] if flat else pairs
 
 
 def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Candidate]:
     """Make a candidate sharp; return all candidates without the other sharp one of its start."""
-    candidate.way = "sharp"
+    candidate.schedule = "sharp"
     return [
         one
         for one in candidates
-        if one is candidate or (one.start, one.way) != (candidate.start, candidate.way)
+        if one is candidate or (one.start, one.schedule) != (candidate.start, candidate.schedule)
     ]
 
 
 def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
     """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
-    plans = planned(dict.fromkeys(starts, 0.0))
-    further = max(1, len({start for start, _ in plans if start not in ("fuller", "sheet")}))
-    return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
+    pairs = planned(dict.fromkeys(starts, 0.0))
+    further = max(1, len({start for start, _ in pairs if start not in ("fuller", "sheet")}))
+    return len(pairs) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
 
 
 def after_first_stage(
@@ -145,20 +145,20 @@ def after_first_stage(
     follow the onsets and planes do not. Else each start goes on in its better way, ``levels`` and
     ``fuller`` as one, but none that is clearly worse.
     """
-    good = TOLERATED * min(one.objectives[-1] for one in candidates)
-    sheets = [one for one in candidates if one.way == "sheet"]
+    good = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
+    sheets = [one for one in candidates if one.schedule == "sheet"]
     if any(one.objectives[-1] <= good for one in sheets):
         return sheets
-    if candidates[0].way == "planes" and len(candidates) > 1:
+    if candidates[0].schedule == "planes" and len(candidates) > 1:
         pair = [candidates[0], after_first_stage(candidates[1:], misfit)[0]]
         errors = [one.objectives[-1] - misfit(one.meshes[-1]) for one in pair]
         first, second = np.argsort(errors, kind="stable")
-        clear = TOLERATED * errors[first] < errors[second]
+        clear = CHANCE_RATIO * errors[first] < errors[second]
         return [pair[first]] if clear else [pair[first], pair[second]]
-    left = [one for one in candidates if one.way != "sheet"] or sheets
+    left = [one for one in candidates if one.schedule != "sheet"] or sheets
     network = [one for one in left if one.start in LEVELS]
     others = [one for one in left if one.start not in LEVELS]
-    chosen = [_better(ways) for ways in (network, others) if ways]
+    chosen = [_better(group) for group in (network, others) if group]
     for one in chosen:
         if one.start == "fuller":  # it goes on as levels, and is compared with that start
             one.start = "levels"
@@ -167,26 +167,29 @@ def after_first_stage(
     return sorted(chosen, key=lambda one: one.objectives[-1])
 
 
-def _better(ways: list[Candidate]) -> Candidate:
+def _better(candidates: list[Candidate]) -> Candidate:
     """Return the way that explains the echoes best, of one start or of both by the network.
 
     In doubt, a sharp one by the network, whose surfaces are smooth, so that blur wears edges and
     strokes away; of these a fuller one, because gaps stay and what is too thick becomes thinner.
     Other starts are rough, and in doubt a blurred one goes on.
     """
-    near = TOLERATED * min(one.objectives[-1] for one in ways)
+    near = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
 
     def order(one: Candidate) -> tuple[bool, bool, bool, float]:
         network = one.start in LEVELS
-        unfit = (one.way == "blurred") == network
+        unfit = (one.schedule == "blurred") == network
         return one.objectives[-1] > near, unfit, one.start == "levels", one.objectives[-1]
 
-    return min(ways, key=order)
+    return min(candidates, key=order)
 
 
 def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
     """Return whether two surfaces sound alike after the first stage, at the shortest wavelength."""
-    return float(distances(one.meshes[1], other.meshes[1]).mean()) <= ALIKE * wavelength
+    return (
+        float(distances(one.meshes[1], other.meshes[1]).mean())
+        <= SAME_SURFACE_DISTANCE * wavelength
+    )
 
 
 def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
@@ -195,7 +198,7 @@ def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], 
     if least.objective <= RANKS_DB or len(candidates) == 1:
         return least
     closed = [one for one in candidates if is_closed(one.meshes[one.best])] or candidates
-    near = TOLERATED * min(one.objective for one in closed)
+    near = CHANCE_RATIO * min(one.objective for one in closed)
     return min(closed, key=lambda one: (one.objective > near, one.start != "levels", one.objective))
 
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.refinement.objective import (
-    ONSETS,
-    Level,
+    ONSET_WEIGHT,
+    ErrorLevel,
     OnsetRanges,
     differences,
     measured,
@@ -29,24 +29,24 @@ from sononerf.refinement.tracer import Correction, LaterBounces, StillSurface, l
 
 POSES = 8
 """Number of training poses per step."""
-LAST = 0.2
+LAST_STEP = 0.2
 """Final step length over the initial one, no unit; cosine decay in between."""
 MOMENTUM = 0.8
 """Decay rate per step of the running mean of the gradient, no unit."""
-MEMORY = 0.95
+SQUARE_DECAY = 0.95
 """Decay rate per step of the running mean of the squared gradient, no unit."""
-LOCAL = 0.1
+LOCAL_FLOOR = 0.1
 """Floor of the local mean square of the gradient, as a fraction of its mean over the surface: steps
 stay small where little is heard."""
-TANGENT = 0.2
+TANGENTIAL_FRACTION = 0.2
 """Fraction of the tangential way to the neighbours' mean that a vertex moves per step; it keeps
 triangles even."""
-SIGHT = 4
+VISIBILITY_STEPS = 4
 """Number of steps for which the search structure of visibility is kept."""
-STANDS = 0.1
+STANDING_HEIGHT = 0.1
 """Height over the support up to which a vertex stays on it, edges. Surfaces are cut at the support
 to within a small part of an edge."""
-NEAR = 0.5
+MIN_SUPPORT = 0.5
 """Fade and spread at the lowest frequency above which a pose supports a vertex."""
 
 
@@ -61,7 +61,7 @@ class Descent:
         mesh: trimesh.Trimesh,
         echoes: Echoes,
         optics: Optics,
-        level: Level,
+        level: ErrorLevel,
         *,
         smoothing: float,
         rate: float,
@@ -91,8 +91,8 @@ class Descent:
         self._later, self._correction, self._onsets = later, correction, onsets
         self.rate, self.band = rate, band
         if optics.plane is not None:  # no vertex goes below it, and vertices on it stay there
-            self._stands = optics.plane.height(self.vertices) < STANDS * edge
-        self._sides = Sides(mesh, APART * optics.wavelength) if sheet else None
+            self._stands = optics.plane.height(self.vertices) < STANDING_HEIGHT * edge
+        self._sides = Sides(mesh, MIN_THICKNESS * optics.wavelength) if sheet else None
 
     def mesh(self) -> trimesh.Trimesh:
         """Return the present surface."""
@@ -110,16 +110,16 @@ class Descent:
         self.count += 1
         smooth = self.operators.smoothed(gradient, self.strength)
         self.direction = MOMENTUM * self.direction + (1 - MOMENTUM) * smooth
-        self.square = MEMORY * self.square + (1 - MEMORY) * smooth.square()
+        self.square = SQUARE_DECAY * self.square + (1 - SQUARE_DECAY) * smooth.square()
         usual = self.operators.smoothed(self.square, 2.0 * self.strength).clamp_min(0.0)
-        usual = usual / (1 - MEMORY**self.count)
-        usual = torch.sqrt(usual + LOCAL * usual.mean()).clamp_min(1e-300)
+        usual = usual / (1 - SQUARE_DECAY**self.count)
+        usual = torch.sqrt(usual + LOCAL_FLOOR * usual.mean()).clamp_min(1e-300)
         rate = self.rate * self.smoothing
-        rate *= LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * part))
+        rate *= LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * part))
         move = self.direction / (1 - MOMENTUM**self.count) / usual
         move = self.operators.smoothed(move, self.strength)
         self.vertices = self.vertices - rate * move.clamp(-4.0, 4.0) * normals
-        self.vertices = self.operators.relaxed(self.vertices, normals, TANGENT)
+        self.vertices = self.operators.relaxed(self.vertices, normals, TANGENTIAL_FRACTION)
         if self._sides is not None:
             self.vertices = self._sides.apart(self.vertices, normals)
         if (plane := self.optics.plane) is not None:
@@ -136,7 +136,7 @@ class Descent:
         area = self.operators.areas(self.vertices)
         bending = self.operators.bending(self.vertices, unit(area), self.passes)
         moved = self._seen is not self.vertices
-        if self._sight is None or (moved and self.count % SIGHT == 0):
+        if self._sight is None or (moved and self.count % VISIBILITY_STEPS == 0):
             self._seen = self.vertices
             self._sight = sight_of(self.optics, self._seen.cpu().numpy(), self.faces)
         places = torch.as_tensor(self.echoes.positions[numbers]).to(self.vertices)
@@ -174,7 +174,7 @@ class Descent:
         (through,) = torch.autograd.grad(self.operators.areas(moved), moved, to_areas.double())
         total = through + to_points.double()
         if self._onsets is not None:
-            total = total + ONSETS * self._onsets.gradient(self.vertices, number)
+            total = total + ONSET_WEIGHT * self._onsets.gradient(self.vertices, number)
         return (total * normals).sum(1, keepdim=True), float(errors.detach().mean())
 
 
@@ -184,7 +184,7 @@ def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Te
     count = torch.zeros(len(surface.vertices), device=surface.vertices.device)
     for some in np.array_split(training, -(-len(training) // POSES)):
         pieces, heads, _ = surface.listen(echoes.positions[some], echoes.rotations[some])
-        near = pieces.reach.amax(1) > NEAR
+        near = pieces.reach.amax(1) > MIN_SUPPORT
         pose = pieces.pose[near] % heads.poses
         # On a support a pose may see a vertex in several ways.
         vertex = torch.unique(pieces.vertex[near] * heads.poses + pose) // heads.poses
@@ -192,7 +192,7 @@ def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Te
     return count
 
 
-APART = 0.15
+MIN_THICKNESS = 0.15
 """Least thickness of a sheet, shortest wavelengths. A thinner one sounds the same, but its sides
 could change places, and each would hide the other."""
 _OPPOSED = -0.5  # cosine between the normals of two sides, at most
@@ -252,7 +252,7 @@ STAGES = (
     Stage(smoothing=1.0, edge=0.6, blur=0.2, rate=0.02, steps=30, beyond="keep"),
     Stage(smoothing=0.7, edge=0.5, blur=0.0, rate=0.02, steps=40, beyond="simulate"),
 )
-SHARP = 0.5
+SHARP_EDGE = 0.5
 """Edge length of the triangles if the surface is not blurred, shortest wavelengths. The first stage
 runs both blurred and sharp, and the surface that explains the validation poses better continues.
 Blur removes dents and necks, but also edges, sheets and wires."""

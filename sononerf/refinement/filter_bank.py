@@ -43,7 +43,7 @@ class Arrivals:
 
 
 class FilterBank:
-    """Filters of one call and analysis, computed at the first use of a length.
+    """Filters of one call and spectrogram, computed at the first use of a length.
 
     In: nodes ((N,), Hz), soft (Hz).
 
@@ -54,9 +54,9 @@ class FilterBank:
     """
 
     def __init__(self, head: Head, nodes: Floats, soft: float) -> None:
-        self.head, self.analysis, self.nodes, self.soft = head, head.analysis, nodes, soft
+        self.head, self.spectrogram, self.nodes, self.soft = head, head.spectrogram, nodes, soft
         self.filters = head.row_filters
-        rate = self.analysis.sampling_rate
+        rate = self.spectrogram.sampling_rate
         self._band = self.filters.band
         self.spacing = 2.0 * float(nodes[0])
         self._top = self.spacing * len(nodes)
@@ -70,7 +70,7 @@ class FilterBank:
 
         Out: power ((receivers, frames, F) float32).
         """
-        length = frames * self.analysis.hop * self.finer
+        length = frames * self.spectrogram.hop * self.finer
         spectra = []
         for source, some in arrivals.items():
             first, at = some.receiver * length, some.at * self.finer
@@ -89,8 +89,8 @@ class FilterBank:
         return (surface if source == "surface" else edge), rows
 
     def _make_filter(self, frames: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        analysis, rate = self.analysis, self.analysis.sampling_rate
-        length = frames * analysis.hop
+        spectrogram, rate = self.spectrogram, self.spectrogram.sampling_rate
+        length = frames * spectrogram.hop
         step = rate / length
         most = min(math.floor(self._band[1] / step), length // 2)
         least = max(math.ceil(self._band[0] / step), -most)
@@ -115,7 +115,7 @@ class FilterBank:
             np.exp(-2j * np.pi / rate * np.outer(frequency, np.arange(len(call)))) @ call
         )
         rows = rows * np.exp(2j * np.pi * np.outer(self.head.delay, frequency))
-        rows = rows / analysis.hop
+        rows = rows / spectrogram.hop
         made = (torch.as_tensor(part.astype(np.complex64)) for part in (surface, edge, rows))
         first, second, third = (part.to(like.device) for part in made)
         return first, second, third
@@ -134,8 +134,8 @@ class FilterBank:
         return (echo.real.square() + echo.imag.square()).transpose(1, 2)
 
     def _positive(self, frames: int) -> int:
-        step = self.analysis.sampling_rate / (frames * self.analysis.hop)
-        return min(math.floor(self._band[1] / step), frames * self.analysis.hop // 2) + 1
+        step = self.spectrogram.sampling_rate / (frames * self.spectrogram.hop)
+        return min(math.floor(self._band[1] / step), frames * self.spectrogram.hop // 2) + 1
 
 
 class _Deposit(torch.autograd.Function):

@@ -22,7 +22,7 @@ from sononerf.refinement.optics import Heard, Optics
 from sononerf.refinement.remesh import finer
 from sononerf.refinement.tracer import Tracer, on_rows
 
-ONSETS = 3.0
+ONSET_WEIGHT = 3.0
 """Weight of the misfit of onsets beside the mismatch, dB. Without it the edges of a box are cut
 off; with 30 the surface follows the errors of the onsets."""
 FLOOR_DB = 20.0
@@ -34,16 +34,16 @@ ALIKE_DB = 3.0
 """Difference between simulator and physical optics at which a cell has half the weight, dB."""
 LOUD_DB = 16.0
 """Level below a pose's loudest cell down to which cells determine the gain, dB."""
-LEARNING = 0.05
+RUNNING_WEIGHT = 0.05
 """Weight of one step in the running means of gain and error, no unit."""
-TRUST = 4.0
+ERROR_EXPONENT = 4.0
 """Exponent of a frequency's usual error, by whose inverse power the frequency is weighted. Where
 physical optics is wrong (ka below 10) the error stays large, and even a little of it biases the
 surface."""
 _DB = 20.0 / math.log(10.0)
 
 
-class Level:
+class ErrorLevel:
     """Running estimates on the training poses: gain, and error per ear and frequency.
 
     Attributes:
@@ -76,7 +76,7 @@ class Level:
     @property
     def weight(self) -> Tensor:
         """Weight of ears and frequencies (E, F), falling with their usual error."""
-        weight = self.error.clamp_min(0.25 * float(self.error.median())) ** -TRUST
+        weight = self.error.clamp_min(0.25 * float(self.error.median())) ** -ERROR_EXPONENT
         return weight / weight.mean()
 
 
@@ -102,7 +102,7 @@ def differences(
     heard: Heard,
     later: Tensor | None,
     measurement: tuple[Tensor, Tensor, Tensor],
-    level: Level,
+    level: ErrorLevel,
     *,
     corrected: tuple[Tensor, Tensor] | None = None,
     learn: bool,
@@ -156,7 +156,7 @@ def over_band(power: Tensor, part: float) -> Tensor:
 
 
 def _learn(
-    level: Level,
+    level: ErrorLevel,
     magnitude: Tensor,
     rendered: Tensor,
     a: Tensor,
@@ -164,7 +164,7 @@ def _learn(
     active: Tensor,
     loudest: Tensor,
 ) -> None:
-    rate = max(LEARNING, 1.0 / (level.steps + 2))
+    rate = max(RUNNING_WEIGHT, 1.0 / (level.steps + 2))
     level.steps += 1
     count = active.sum((0, 2))
     error = ((a - b).abs() * active).sum((0, 2)) / count.clamp_min(1)
@@ -180,7 +180,7 @@ def _learn(
     level.gain = level.gain + rate * torch.nan_to_num(step)
 
 
-SCALE = 0.19
+HUBER_SCALE = 0.19
 """Misfit at which Huber's loss turns linear, range resolutions. At 0.1, the accuracy of the
 detector, the onsets outweigh the spectrograms: the Chamfer distance of ua rises from 0.94 mm to
 1.25 mm (means of two seeds of the refinement)."""
@@ -194,16 +194,16 @@ class OnsetRanges:
     least range over the surface must be the onset. Physical optics alone does not ensure this: if a
     pose hears only a quiet edge, the descent can make the edge quieter by cutting it off.
 
-    Up to ``SCALE`` the misfit is quadratic, beyond it is linear (Huber's loss).
+    Up to ``HUBER_SCALE`` the misfit is quadratic, beyond it is linear (Huber's loss).
 
     In: resolution (m).
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:
-        self.scale, self.seed = SCALE * resolution, seed
-        known = np.isfinite(hull.trusted)
+        self.scale, self.seed = HUBER_SCALE * resolution, seed
+        known = np.isfinite(hull.inlier_onsets)
         pose, ear = np.nonzero(known)
-        self._first = hull.trusted[known]
+        self._first = hull.inlier_onsets[known]
         self._emitters, self._receivers = hull.emitters[pose], hull.receivers[pose, ear]
 
     def __len__(self) -> int:
@@ -244,8 +244,8 @@ class OnsetRanges:
             return total
         rng = np.random.default_rng([self.seed, number])
         some = rng.choice(len(self), min(_POSES, len(self)), replace=False)
-        off, nearest, way = self._off(vertices, some)
-        slope = off.clamp(-1.0, 1.0)[:, None] * way / (self.scale * len(some))
+        off, nearest, gradient = self._off(vertices, some)
+        slope = off.clamp(-1.0, 1.0)[:, None] * gradient / (self.scale * len(some))
         return total.index_add_(0, nearest, slope)
 
     def _off(self, vertices: Tensor, some: NDArray[np.intp]) -> tuple[Tensor, Tensor, Tensor]:
@@ -257,13 +257,13 @@ class OnsetRanges:
         ranges = (torch.cdist(vertices, emitters) + torch.cdist(vertices, receivers)) / 2
         least, nearest = ranges.min(0)
         out, back = vertices[nearest] - emitters, vertices[nearest] - receivers
-        way = out / out.norm(dim=1, keepdim=True) + back / back.norm(dim=1, keepdim=True)
-        return (least - first) / self.scale, nearest, way / 2
+        gradient = out / out.norm(dim=1, keepdim=True) + back / back.norm(dim=1, keepdim=True)
+        return (least - first) / self.scale, nearest, gradient / 2
 
 
-ASKED = 24
+MAX_VALIDATION_POSES = 24
 """Number of validation poses, at most, that compare surfaces."""
-LATE = 0.25
+ONSET_DELAY = 0.25
 """By how much the onsets may come late, range resolutions: an echo is found when it has risen.
 Those of true bodies of bars come late by 0.14 at the median. Free surfaces follow them; counted as
 they are, they would be an error of the truth."""
@@ -272,8 +272,8 @@ RAYS = 30_000
 by 0.2 dB."""
 
 
-class Comparison:
-    """Comparison of surfaces by the validation poses and the onsets.
+class SurfaceComparison:
+    """SurfaceComparison of surfaces by the validation poses and the onsets.
 
     The mean error of validation poses, traced off the surface by the simulator's rays, and the
     misfit of the onsets as in the descent. A pose counts by the square root of its loudest cell:
@@ -289,19 +289,23 @@ class Comparison:
 
     def __init__(self, echoes: Echoes, optics: Optics, onsets: OnsetRanges, seed: int) -> None:
         self.echoes, self.optics, self.onsets, self.seed = echoes, optics, onsets, seed
-        chosen = np.linspace(0, len(echoes.validation) - 1, min(ASKED, len(echoes.validation)))
+        chosen = np.linspace(
+            0, len(echoes.validation) - 1, min(MAX_VALIDATION_POSES, len(echoes.validation))
+        )
         self.poses = echoes.validation[chosen.astype(np.int64)]
 
-    def objective(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
+    def objective(self, mesh: trimesh.Trimesh, level: ErrorLevel, *, smooth: bool) -> float:
         """Return the error of a surface and the misfit of its onsets, dB; as :meth:`error`."""
         return self.error(mesh, level, smooth=smooth) + self.misfit(mesh)
 
     def misfit(self, mesh: trimesh.Trimesh) -> float:
         """Return the part of the objective that the onsets have, dB."""
         vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
-        return ONSETS * self.onsets.misfit(vertices, LATE * self.optics.head.resolution)
+        return ONSET_WEIGHT * self.onsets.misfit(
+            vertices, ONSET_DELAY * self.optics.head.resolution
+        )
 
-    def error(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
+    def error(self, mesh: trimesh.Trimesh, level: ErrorLevel, *, smooth: bool) -> float:
         """Return the error of a surface on the validation poses, dB; infinite if all are silent.
 
         Args:

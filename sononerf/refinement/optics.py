@@ -33,10 +33,10 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 FADE_FREQUENCY = 0.25
 """Frequency below which the fade no longer falls, over the highest analysed frequency: as in the
 simulator, 25 of 100 kHz."""
-SILENT = 3.0
+SILENT_EXPONENT = 3.0
 """Exponent of fade and spread at the lowest analysed frequency above which a piece is left out: 26
 dB down. Such pieces cancel one another."""
-SPREAD = 5.0 / 52.0
+PATH_VARIANCE = 5.0 / 52.0
 """Variance of the path over a piece of area 1 and slope 1: between that of a hexagon and that of a
 triangle."""
 
@@ -105,10 +105,10 @@ class Optics(nn.Module):
         super().__init__()
         self.head = head.without_noise()
         self.plane = head.plane
-        hearing, analysis = hearing or hearing_of(self.head), head.analysis
-        self.analysis = analysis
+        hearing, spectrogram = hearing or hearing_of(self.head), head.spectrogram
+        self.spectrogram = spectrogram
         self.speed_of_sound = head.speed_of_sound
-        rate = analysis.sampling_rate
+        rate = spectrogram.sampling_rate
         rows = head.frequency
         self.frequencies = rows
         self.ears = len(head.receivers)
@@ -116,7 +116,7 @@ class Optics(nn.Module):
         self.rows = len(axis)
         filters = head.row_filters
         start = axis[0] * 2.0 * rate / self.speed_of_sound - filters.centre
-        self._first = round(start / analysis.hop)
+        self._first = round(start / spectrogram.hop)
         self.wavelength = head.wavelength
         self._reads = filters.envelope.shape[1]
         self._soft = FADE_FREQUENCY * float(rows[-1])
@@ -125,21 +125,21 @@ class Optics(nn.Module):
         ring = rate / self.bank.spacing + max(0, head.window.shape[1] - self._reads) / 2.0
         self._pad = math.ceil(ring)
         nodes = hearing.synthesis.nodes[self.kept_nodes]
-        turn = 2.0 * math.pi / self.speed_of_sound
+        per_second = 2.0 * math.pi / self.speed_of_sound
         decay = hearing.absorption[self.kept_nodes] * (math.log(10.0) / 20.0)
         tables = hearing.ears._by_direction[:, :, self.kept_nodes]
         self._grid = (len(hearing.ears.elevation), len(hearing.ears.azimuth))
         lowest = float(rows[0])
         for name, values in (
-            ("wavenumber", turn * nodes),
-            ("fade", turn * np.hypot(nodes, self._soft)),
+            ("wavenumber", per_second * nodes),
+            ("fade", per_second * np.hypot(nodes, self._soft)),
             ("decay", decay),
             ("tables", tables),
             ("emitter", hearing.ears.emitter),
             ("places", hearing.ears.positions),
         ):
             self.register_buffer(name, torch.as_tensor(np.ascontiguousarray(values)).float())
-        self._lowest = (turn * lowest, turn * math.hypot(lowest, self._soft))
+        self._lowest = (per_second * lowest, per_second * math.hypot(lowest, self._soft))
 
     def heads(self, positions: Tensor, rotations: Tensor) -> Heads:
         """Return emitters and ears of poses (P, 3), m, and (P, 3, 3), with their images."""
@@ -149,20 +149,20 @@ class Optics(nn.Module):
         ears = positions[:, None] + torch.einsum("pij,ej->pei", rotations, places)
         if (plane := self.plane) is None:
             return Heads(emitters, ears, rotations, rotations, len(positions))
-        turn = torch.as_tensor(plane.turn).to(positions)
+        reflection = torch.as_tensor(plane.reflection).to(positions)
         normal = torch.tensor(plane.normal).to(positions)
 
         def both(points: Tensor) -> tuple[Tensor, Tensor]:
             return points, points - 2.0 * plane.height(points)[..., None] * normal
 
         from_, to = both(emitters), both(ears)
-        turned = rotations, turn @ rotations
-        ways = ((0, 0), (1, 0), (0, 1), (1, 1))
+        rotated = rotations, reflection @ rotations
+        paths = ((0, 0), (1, 0), (0, 1), (1, 1))
         return Heads(
-            torch.cat([from_[one] for one, _ in ways]),
-            torch.cat([to[other] for _, other in ways]),
-            torch.cat([turned[one] for one, _ in ways]),
-            torch.cat([turned[other] for _, other in ways]),
+            torch.cat([from_[one] for one, _ in paths]),
+            torch.cat([to[other] for _, other in paths]),
+            torch.cat([rotated[one] for one, _ in paths]),
+            torch.cat([rotated[other] for _, other in paths]),
             len(positions),
         )
 
@@ -207,7 +207,7 @@ class Optics(nn.Module):
         slope = g1 * g1 + g2 * g2
         detour = 0.5 * (a * slope + b * (h11 * g1 * g1 + h22 * g2 * g2 + 2.0 * h12 * g1 * g2))
         detour = detour.clamp_min(0.0)
-        spread = SPREAD * slope * size
+        spread = PATH_VARIANCE * slope * size
         k, fade = self._lowest
         exponent = 0.5 * k * k * spread + fade * detour
         return (rise > 0) & (back > 0), spread, detour, d1 + d2, exponent
@@ -247,7 +247,7 @@ class Optics(nn.Module):
         place, normal, bent = points[vertex], area[vertex], bending[vertex]
         out = place - emitters[pose]
         out = out / out.norm(dim=1, keepdim=True)
-        turned = heads.hearing[pose]
+        rotation = heads.hearing[pose]
         beam = self.gains(torch.zeros_like(pose), out, heads.emitting[pose])
         weights, reaches = [], []
         wavenumber, fade, decay = (
@@ -263,7 +263,7 @@ class Optics(nn.Module):
             back = back / back.norm(dim=1, keepdim=True)
             loss = torch.addr(spread[:, None] * half, detour, fade)
             loss = torch.addr(loss, path, decay)
-            gain = self.gains(torch.full_like(pose, 1 + ear), back, turned) * beam
+            gain = self.gains(torch.full_like(pose, 1 + ear), back, rotation) * beam
             seen = visible[:, ear] * facing
             weights.append(gain * torch.exp(-loss) * seen[:, None])
             reaches.append(torch.exp(-exponent) * seen)
@@ -292,17 +292,17 @@ class Optics(nn.Module):
         d1, d2 = u.norm(dim=1), v.norm(dim=2)
         both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
         strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
-        ways: dict[Source, Paths] = {
+        paths_by_source: dict[Source, Paths] = {
             "surface": Paths(pieces.pose, strength, d1[:, None] + d2, pieces.weight)
         }
         if edges is not None:
-            ways["edge"] = edges
+            paths_by_source["edge"] = edges
         # Sound by different ways adds up in phase.
         poses = heads.poses
-        pose = {source: some.pose % poses for source, some in ways.items()}
-        samples = self.analysis.sampling_rate / self.speed_of_sound
+        pose = {source: some.pose % poses for source, some in paths_by_source.items()}
+        samples = self.spectrogram.sampling_rate / self.speed_of_sound
         paths = {}
-        for source, some in ways.items():
+        for source, some in paths_by_source.items():
             path = some.length
             if stretch is not None:
                 path = path * stretch[pose[source]][:, None]
@@ -311,10 +311,10 @@ class Optics(nn.Module):
             paths[source] = path * samples
         whole = torch.cat([path.detach() for path in paths.values()])
         frames, row = self._span(whole, torch.cat([*pose.values()]), poses)
-        origin = (row + self._first) * self.analysis.hop
+        origin = (row + self._first) * self.spectrogram.hop
         ear = torch.arange(self.ears, device=row.device)
         arrivals = {}
-        for source, some in ways.items():
+        for source, some in paths_by_source.items():
             at = paths[source] - origin.to(paths[source].dtype)[pose[source]][:, None]
             receiver = pose[source][:, None] * self.ears + ear
             arrivals[source] = Arrivals(
@@ -334,9 +334,9 @@ class Optics(nn.Module):
         In: pose, ear (N,), delay ((N,), s), weight ((N, N') float32).
         """
         poses, _, frames, _ = like.power.shape
-        start = ((like.row + self._first) * self.analysis.hop).to(delay.dtype)
-        at = delay * self.analysis.sampling_rate - start[pose]
-        last = frames * self.analysis.hop - self._pad
+        start = ((like.row + self._first) * self.spectrogram.hop).to(delay.dtype)
+        at = delay * self.spectrogram.sampling_rate - start[pose]
+        last = frames * self.spectrogram.hop - self._pad
         inside = torch.nonzero((at > self._pad) & (at < last))[:, 0]
         at = at[inside].float()
         receiver = (pose * self.ears + ear)[inside]
@@ -346,7 +346,7 @@ class Optics(nn.Module):
 
     def _span(self, path: Tensor, pose: Tensor, poses: int) -> tuple[int, Tensor]:
         """Return the number of frames that holds any pose's echoes, and each pose's first."""
-        hop, window = self.analysis.hop, self._reads
+        hop, window = self.spectrogram.hop, self._reads
         late, early = path.amax(1), path.amin(1)
         huge = torch.full((poses,), torch.inf, device=path.device, dtype=path.dtype)
         nearest = huge.scatter_reduce(0, pose, early, "amin")

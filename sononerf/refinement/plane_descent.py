@@ -22,20 +22,20 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.meshes import CREASE
 from sononerf.geometry.raycast import Occlusion
 from sononerf.numerics import Bools, Floats, Ints
-from sononerf.refinement.descent import LAST, MEMORY, MOMENTUM
-from sononerf.refinement.objective import Level, differences, measured, mismatch
+from sononerf.refinement.descent import LAST_STEP, MOMENTUM, SQUARE_DECAY
+from sononerf.refinement.objective import ErrorLevel, differences, measured, mismatch
 from sononerf.refinement.optics import Heads, Heard, Optics, Paths
 from sononerf.refinement.planes import Patches, flat_parts, motions, on_patches, patches_of
 from sononerf.refinement.remesh import MeshOperators, unit
-from sononerf.refinement.tracer import FREE, LaterBounces, listen, seen, sight_of
+from sononerf.refinement.tracer import FREE_DISTANCE, LaterBounces, listen, seen, sight_of
 from sononerf.simulation.diffraction import wedge_directivity
 
-LIFT = 0.02
+EDGE_LIFT = 0.02
 """Height above an edge from which it is seen, shortest wavelengths: more than the rounding of ray
 casting, less than anything that is heard."""
 
 
-class Edges:
+class CreaseEdges:
     """Edges of a mesh between faces on different planes.
 
     In: faces (T, 3), plane (T,), adjacency (K, 2), ends (K, 2).
@@ -65,9 +65,9 @@ class Edges:
         places, upright = (part.detach().cpu().numpy() for part in (vertices, normals))
         first, second = upright[:, 0], upright[:, 1]
         start, end = places[self.ends[:, 0]], places[self.ends[:, 1]]
-        turned = np.einsum("kd,kd->k", np.cross(first, second), end - start)
+        convexity = np.einsum("kd,kd->k", np.cross(first, second), end - start)
         cosine = np.einsum("kd,kd->k", first, second)
-        sharp = np.flatnonzero((turned > 0.0) & (cosine <= math.cos(CREASE)))
+        sharp = np.flatnonzero((convexity > 0.0) & (cosine <= math.cos(CREASE)))
         pose, edge, visible = _seen(
             optics, start[sharp], end[sharp], first[sharp], second[sharp], sight, heads
         )
@@ -102,8 +102,8 @@ def _seen(
     pose, edge = np.nonzero((above[0] > 0.0) | (above[1] > 0.0))
     away = first + second
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    place = (middle + LIFT * optics.wavelength * away)[edge]
-    free = FREE * optics.wavelength
+    place = (middle + EDGE_LIFT * optics.wavelength * away)[edge]
+    free = FREE_DISTANCE * optics.wavelength
     lit = seen(sight, place, emitters[pose], free=free)
     pose, edge, place = pose[lit], edge[lit], place[lit]
     visible = np.zeros((len(pose), optics.ears), dtype=bool)
@@ -149,26 +149,26 @@ def _sound(
     return Paths(pose, strength.float(), (d1[:, None] + d2).float(), torch.stack(weights, 1))
 
 
-TOLERANCE = 0.3
+MAX_PLANE_DEVIATION = 0.3
 """Standard deviation of a flat part from its plane, at most, shortest wavelengths: a start is known
 to a third of a wavelength."""
-LEAST = 1.4
+MIN_PART_SIZE = 1.4
 """Square root of the least area of a flat part, shortest wavelengths; a smaller one is no
 mirror. Of bodies of bars, one ends at 0.68 mm for 1.04 mm with 2, another one at 0.67 for 0.78."""
-RATE = 0.4
+FIRST_STEP = 0.4
 """Length of the first steps of a plane, shortest wavelengths, over the rate of the stage."""
 POSES = 16
 """Number of training poses per step; a plane is heard by few of them. A body of bars ends at
 1.05 mm with 8 and at 0.98 mm with 16, in 1.07 times the time."""
-QUIET = 0.1
+GRADIENT_FLOOR = 0.1
 """Floor of a motion's usual gradient, as a fraction of the mean over all of them: planes move
 little where little is heard."""
-LARGEST = 3.0
+MAX_STEP = 3.0
 """Largest step of a motion, in steps of the usual length."""
-FARTHEST = 1.5
+MAX_VERTEX_MOVE = 1.5
 """Distance that a vertex of an edge can move in a stage, shortest wavelengths: a corner that is
 rounded by a wavelength comes back, but no spike grows."""
-EVENED = 5
+REMESH_STEPS = 5
 """Number of steps after which triangles are made even again; those that were turned over along an
 edge would sound like many edges."""
 
@@ -180,11 +180,11 @@ def flattened(
 
     In: wavelength (m).
     """
-    tolerance = TOLERANCE * wavelength
-    part = flat_parts(mesh, tolerance, (LEAST * wavelength) ** 2)
+    tolerance = MAX_PLANE_DEVIATION * wavelength
+    part = flat_parts(mesh, tolerance, (MIN_PART_SIZE * wavelength) ** 2)
     patches = patches_of(mesh, part, tolerance, bent=bent)
     home = np.asarray(mesh.vertices)
-    return on_patches(mesh, part, patches, home, FARTHEST * wavelength), part, patches
+    return on_patches(mesh, part, patches, home, MAX_VERTEX_MOVE * wavelength), part, patches
 
 
 def flattest(
@@ -215,7 +215,7 @@ class PlaneDescent:
         mesh: trimesh.Trimesh,
         echoes: Echoes,
         optics: Optics,
-        level: Level,
+        level: ErrorLevel,
         *,
         rate: float,
         later: LaterBounces | None = None,
@@ -223,13 +223,13 @@ class PlaneDescent:
         seed: int,
     ) -> None:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
-        self.rate, self.band, self._later = RATE * rate * optics.wavelength, band, later
+        self.rate, self.band, self._later = FIRST_STEP * rate * optics.wavelength, band, later
         self.faces, self._start = np.array(mesh.faces, dtype=np.int64), np.array(mesh.vertices)
         self.bent = band < 1.0
         flat, part, self.patches = flattened(mesh, optics.wavelength, bent=self.bent)
         self.part, self.vertices = part, np.array(flat.vertices, dtype=np.float64)
         pairs, ends = mesh.face_adjacency, mesh.face_adjacency_edges
-        self.edges = Edges(self.faces, part, np.asarray(pairs), np.asarray(ends))
+        self.edges = CreaseEdges(self.faces, part, np.asarray(pairs), np.asarray(ends))
         # At an edge each face has vertices of its own, so that its normals are not averaged.
         count = int(part.max()) + 1
         own, corner = np.unique(self.faces * count + part[:, None], return_inverse=True)
@@ -255,18 +255,18 @@ class PlaneDescent:
         motion = motions(self.vertices, self.faces, self.part, self.patches, self.terms)
         slope = motion.T @ gradient.ravel()
         self.direction = MOMENTUM * self.direction + (1 - MOMENTUM) * slope
-        self.square = MEMORY * self.square + (1 - MEMORY) * np.square(slope)
-        usual = self.square / (1 - MEMORY**self.count)
-        usual = np.sqrt(usual + QUIET**2 * usual.mean()) + 1e-300
-        rate = self.rate * (LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * part)))
+        self.square = SQUARE_DECAY * self.square + (1 - SQUARE_DECAY) * np.square(slope)
+        usual = self.square / (1 - SQUARE_DECAY**self.count)
+        usual = np.sqrt(usual + GRADIENT_FLOOR**2 * usual.mean()) + 1e-300
+        rate = self.rate * (LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * part)))
         step = self.direction / (1 - MOMENTUM**self.count) / usual
-        change = -rate * np.clip(step, -LARGEST, LARGEST)
+        change = -rate * np.clip(step, -MAX_STEP, MAX_STEP)
         self.vertices = self.vertices + (motion @ change).reshape(-1, 3)
         numbers = self.patches.numbers.copy()
         numbers[:, : self.terms] += change.reshape(-1, self.terms)
         self.patches = replace(self.patches, numbers=numbers)
-        if self.count % EVENED == 0:
-            far = FARTHEST * self.optics.wavelength
+        if self.count % REMESH_STEPS == 0:
+            far = MAX_VERTEX_MOVE * self.optics.wavelength
             mesh = on_patches(self.mesh(), self.part, self.patches, self._start, far)
             self.vertices = np.array(mesh.vertices)
         return error
@@ -305,12 +305,12 @@ class PlaneDescent:
         """
         middle = vertices.detach().cpu().numpy()[self.edges.ends].mean(axis=1)
         patches = self.patches
-        turned = [
+        tilt = [
             patches.normals(side, middle) - patches.normals(side, patches.centre[side])
             for side in self.edges.planes.T
         ]
         found = means[torch.as_tensor(self.edges.planes).to(means.device)]
-        return unit(found + torch.as_tensor(np.stack(turned, axis=1)).to(found))
+        return unit(found + torch.as_tensor(np.stack(tilt, axis=1)).to(found))
 
     def _gradient(self, number: int) -> tuple[Floats | None, float]:
         """Return the gradient (V, 3), dB/m, and the mean mismatch, dB."""

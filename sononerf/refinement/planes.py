@@ -18,15 +18,15 @@ from scipy.sparse import csr_array
 
 from sononerf.numerics import Floats, Ints, compiled
 
-COHERENT = 0.9
+MIN_COHERENCE = 0.9
 """Least length of the mean of a part's unit normals, no unit. The two sides of a thin plate have a
 mean of zero, so they stay apart."""
-SMOOTHING = 0.3
+NEIGHBOUR_GAIN = 0.3
 """What a triangle gains by each neighbour of the same part, no unit; its cost is the square of its
 distance from the plane over the tolerance."""
-UPRIGHT = 0.5
+TILT_COST = 0.5
 """Further cost of a triangle whose normal is square to that of the plane, no unit."""
-SWEEPS = 15
+MAX_SWEEPS = 15
 """Number of times that triangles are given to the plane that fits them best, at most."""
 
 
@@ -37,7 +37,7 @@ def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
     """
     corners = np.asarray(mesh.triangles, dtype=np.float64)
     pairs = np.asarray(mesh.face_adjacency, dtype=np.int64)
-    part = _clustered(*_moments(corners), pairs, tolerance**2, COHERENT)
+    part = _clustered(*_moments(corners), pairs, tolerance**2, MIN_COHERENCE)
     part = _given_to_the_best(mesh, _counted(part), tolerance)
     area = np.bincount(part, mesh.area_faces)
     normal, offset = planes_of(mesh, part, tolerance)
@@ -88,12 +88,12 @@ def _given_to_the_best(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> I
     beside[both[inner, 0], rank[inner]] = both[inner, 1]
     for _ in range(2):
         normal, offset = planes_of(mesh, part, tolerance)
-        for sweep in range(SWEEPS):
+        for sweep in range(MAX_SWEEPS):
             choice = np.concatenate([part[:, None], part[beside]], axis=1)
             off = np.einsum("td,tcd->tc", middle, normal[choice]) - offset[choice]
             tilt = 1.0 - np.einsum("td,tcd->tc", upright, normal[choice])
             like = (choice[:, :, None] == part[beside][:, None]).sum(axis=2)
-            cost = np.square(off / tolerance) + UPRIGHT * tilt - SMOOTHING * like
+            cost = np.square(off / tolerance) + TILT_COST * tilt - NEIGHBOUR_GAIN * like
             best = choice[np.arange(len(part)), cost.argmin(axis=1)]
             # Half of them at a time, so that neighbours do not change places for ever.
             best = np.where(np.arange(len(part)) % 2 == sweep % 2, best, part)
@@ -253,20 +253,20 @@ def _clustered(
     return root
 
 
-PARALLEL = 0.05
+MIN_EIGENVALUE = 0.05
 """Eigenvalue of the sum of the normals' outer products below which patches do not determine where
 they meet, no unit: that of two planes at 18 degrees."""
-SOFT = 0.02
+EIGENVALUE_FLOOR = 0.02
 """Added to these eigenvalues where patches move, no unit: vertices between planes that are nearly
 parallel then move by little, and not far along them."""
-EVEN = 20
+EVEN_STEPS = 20
 """Number of steps that make the triangles even again."""
-BENT = 2.0
+MAX_BEND_RADIUS = 2.0
 """Distance from the middle up to which patches bend, root mean squares of the part along that axis:
 a rectangle ends at 1.7."""
 SQUARE = 0.8**0.5
 """Root mean square of u^2 - 1 over a rectangle, no unit."""
-FITS = 3
+PATCH_FITS = 3
 """Number of fits of a bent patch; what is far off the one before counts little."""
 
 
@@ -285,7 +285,10 @@ class Patches:
         The mean square of each is about one over the patch; beyond it nothing bends any more.
         """
         u, v, _ = self._along(of, places).T
-        a, b = np.clip(u, -BENT, BENT), np.clip(v, -BENT, BENT)
+        a, b = (
+            np.clip(u, -MAX_BEND_RADIUS, MAX_BEND_RADIUS),
+            np.clip(v, -MAX_BEND_RADIUS, MAX_BEND_RADIUS),
+        )
         first, second = (2.0 * u - a) * a - 1.0, (2.0 * v - b) * b - 1.0
         return np.stack([np.ones(len(u)), u, v, first / SQUARE, a * b, second / SQUARE], axis=1)
 
@@ -297,7 +300,10 @@ class Patches:
     def normals(self, of: Ints, places: Floats) -> Floats:
         """Return the outward unit normals (M, 3) of patches (M,) at places (M, 3), m."""
         u, v, _ = self._along(of, places).T
-        a, b = np.clip(u, -BENT, BENT), np.clip(v, -BENT, BENT)
+        a, b = (
+            np.clip(u, -MAX_BEND_RADIUS, MAX_BEND_RADIUS),
+            np.clip(v, -MAX_BEND_RADIUS, MAX_BEND_RADIUS),
+        )
         _, *tilt, first, both, second = self.numbers[of].T
         slope = [2.0 * first / SQUARE * a + both * b * (u == a)]
         slope += [2.0 * second / SQUARE * b + both * a * (v == b)]
@@ -358,7 +364,7 @@ def on_patches(
         moved = places.copy()
         moved[vertex[~shared]] += short[~shared]
         size, axes = np.linalg.eigh(_squares(at, upright[shared], len(edge)))
-        inverse = np.where(size > PARALLEL, 1.0 / np.maximum(size, PARALLEL), 0.0)
+        inverse = np.where(size > MIN_EIGENVALUE, 1.0 / np.maximum(size, MIN_EIGENVALUE), 0.0)
         inverse = (axes * inverse[:, None]) @ axes.transpose(0, 2, 1)
         moved[edge] += np.einsum("vij,vj->vi", inverse, summed(at, short[shared], len(edge)))
         away = moved[edge] - home[edge]
@@ -376,7 +382,7 @@ def on_patches(
     near = csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
     degree = near.sum(axis=1)[:, None]
     places = put(np.asarray(mesh.vertices, dtype=np.float64))
-    for _ in range(EVEN):
+    for _ in range(EVEN_STEPS):
         mean = np.where(degree > 0, (near @ places) / np.maximum(degree, 1), places)
         places = put(0.5 * (places + mean))
     return trimesh.Trimesh(places, np.asarray(mesh.faces), process=False)
@@ -389,7 +395,7 @@ def motions(vertices: Floats, faces: Ints, part: Ints, patches: Patches, terms: 
     """
     vertex, patch = members(faces, part)
     upright = patches.normals(patch, vertices[vertex])
-    inverse = np.linalg.inv(_squares(vertex, upright, len(vertices)) + SOFT * np.eye(3))
+    inverse = np.linalg.inv(_squares(vertex, upright, len(vertices)) + EIGENVALUE_FLOOR * np.eye(3))
     moved = np.einsum("mij,mj->mi", inverse[vertex], upright)
     values = moved[:, :, None] * patches.terms(patch, vertices[vertex])[:, None, :terms]
     rows = (3 * vertex)[:, None, None] + np.arange(3)[:, None] + np.zeros(terms, dtype=np.int64)
@@ -416,7 +422,7 @@ def _bent(mesh: trimesh.Trimesh, part: Ints, flat: Patches, tolerance: float) ->
     upright, count = np.asarray(mesh.face_normals), len(flat.centre)
     terms, height = flat.terms(part, middle), flat.off(part, middle)
     patches = flat
-    for _ in range(FITS):
+    for _ in range(PATCH_FITS):
         cosine = (upright * patches.normals(part, middle)).sum(1)
         tilt = np.clip((cosine - 0.7) / 0.3, 0.01, 1.0)
         weight = area * tilt**2 / (1.0 + np.square(patches.off(part, middle) / tolerance))

@@ -29,8 +29,8 @@ from sononerf.refinement.candidates import (
     planned,
     without_twin,
 )
-from sononerf.refinement.descent import POSES, SHARP, STAGES, Descent, Stage, poses_that_hear
-from sononerf.refinement.objective import Comparison, Level, OnsetRanges
+from sononerf.refinement.descent import POSES, SHARP_EDGE, STAGES, Descent, Stage, poses_that_hear
+from sononerf.refinement.objective import ErrorLevel, OnsetRanges, SurfaceComparison
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.plane_descent import POSES as PLANE_POSES
 from sononerf.refinement.plane_descent import PlaneDescent, flattest
@@ -69,9 +69,9 @@ class Refined:
 
 logger = logging.getLogger("sononerf")
 
-SIMULATED = 96
+CORRECTION_POSES = 96
 """Number of training poses for which a surface is simulated; each is drawn about three times."""
-SMOOTH = 1 / 16
+MAX_HULL_RIDGE = 1 / 16
 """Largest height of the ridges of ``hull`` with which it is a start, shortest wavelengths; phases
 change by at most 45 degrees. A hull fits the onsets by construction, so its objective is too good
 where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
@@ -108,7 +108,7 @@ class Refinement:
         self.saved = {} if saved is None else saved
         self._after_step, self._after_stage = after_step, after_stage
         self.onsets = OnsetRanges(echoes.hull, optics.head.resolution, seed)
-        self.comparison = Comparison(echoes, optics, self.onsets, seed)
+        self.comparison = SurfaceComparison(echoes, optics, self.onsets, seed)
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
@@ -145,7 +145,7 @@ class Refinement:
 
     def stage(self, candidate: Candidate, number: int) -> None:
         """Do a stage of a candidate, or take it from the saved ones."""
-        key = f"{candidate.start}-{candidate.way}-{number}"
+        key = f"{candidate.start}-{candidate.schedule}-{number}"
         if key not in self.saved:
             self.saved[key] = self._done(candidate, number)
         elif self._after_step is not None:
@@ -153,7 +153,7 @@ class Refinement:
         saved = self.saved[key]
         mesh = trimesh.Trimesh(saved["vertices"].numpy(), saved["faces"].numpy(), process=False)
         mismatch, objective = float(saved["mismatch"]), float(saved["objective"])
-        if saved["thin"] and candidate.way == "blurred":
+        if saved["thin"] and candidate.schedule == "blurred":
             self.candidates = without_twin(candidate, self.candidates)
         for fault in bytes(saved["faults"].tolist()).decode().splitlines():
             self._note(fault)
@@ -165,7 +165,7 @@ class Refinement:
             {
                 "stage": number,
                 "start": candidate.start,
-                "way": candidate.way,
+                "schedule": candidate.schedule,
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
@@ -183,7 +183,9 @@ class Refinement:
             if self._after_step is not None:
                 self._after_step(1, mismatch)
         mesh, name = descent.mesh(), f"the surface of stage {number}"
-        objective = self._objective(mesh, name, candidate.level, smooth=candidate.way != "planes")
+        objective = self._objective(
+            mesh, name, candidate.level, smooth=candidate.schedule != "planes"
+        )
         text = "\n".join(self.faults[before:]).encode()
         return {
             "vertices": torch.as_tensor(np.array(mesh.vertices)),
@@ -199,15 +201,15 @@ class Refinement:
         """Return the surface that a stage begins with, and whether it is too thin for its blur."""
         stage, unit, plane = self.stages[number], self.optics.wavelength, self.optics.plane
         before = candidate.meshes[-1]
-        if candidate.way in ("sheet", "planes"):
+        if candidate.schedule in ("sheet", "planes"):
             return before, False
         made = None
-        if candidate.way == "blurred":
+        if candidate.schedule == "blurred":
             made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
         # In the first stage such a start becomes sharp; later blurs would remove thin parts.
-        thin = candidate.way == "blurred" and made is None and number == 0
+        thin = candidate.schedule == "blurred" and made is None and number == 0
         if made is None:
-            made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
+            made = remesh(before, min(SHARP_EDGE, stage.edge) * unit, 0.0, plane)
         return (before if made is None else made), thin
 
     def _begun(self) -> list[Candidate]:
@@ -216,7 +218,7 @@ class Refinement:
         errors = dict.fromkeys(self.starts, math.nan)
         if len(names) > 1 and "hull" in names:
             ridges = self.onsets.ridges(self.starts["hull"])
-            if ridges > SMOOTH * self.optics.wavelength:
+            if ridges > MAX_HULL_RIDGE * self.optics.wavelength:
                 names.remove("hull")
                 del errors["hull"]
         if len(names) > 1:
@@ -225,15 +227,17 @@ class Refinement:
         with_planes = [] if self.optics.plane else network
         flat = flattest(with_planes, self._error, self.optics)
         candidates = []
-        for start, way in planned(errors, flat=flat is not None):
-            mesh = flat if way == "planes" and flat is not None else self.starts[start]
-            begun = Candidate(way, start, self._new_level(), [mesh], [errors[start]], self._far)
+        for start, schedule in planned(errors, flat=flat is not None):
+            mesh = flat if schedule == "planes" and flat is not None else self.starts[start]
+            begun = Candidate(
+                schedule, start, self._new_level(), [mesh], [errors[start]], self._far
+            )
             candidates.append(begun)
         return candidates
 
-    def _new_level(self) -> Level:
+    def _new_level(self) -> ErrorLevel:
         like = self.optics.get_buffer("wavenumber")
-        return Level(self.optics.ears, len(self.optics.frequencies), like)
+        return ErrorLevel(self.optics.ears, len(self.optics.frequencies), like)
 
     def _compared(self, name: StartMethod) -> float:
         """Return the objective of a start."""
@@ -245,7 +249,7 @@ class Refinement:
         self,
         mesh: trimesh.Trimesh,
         name: str = "a surface",
-        level: Level | None = None,
+        level: ErrorLevel | None = None,
         *,
         smooth: bool = False,
     ) -> float:
@@ -271,7 +275,7 @@ class Refinement:
         self, candidate: Candidate, number: int, mesh: trimesh.Trimesh
     ) -> Descent | PlaneDescent:
         """Return the descent of a stage."""
-        stage, planes = self.stages[number], candidate.way == "planes"
+        stage, planes = self.stages[number], candidate.schedule == "planes"
         last = number == len(self.stages) - 1
         candidate.level.learns = "none" if self.echoes.calibrated and not last else "each"
         corrects = stage.beyond == "simulate" and not planes
@@ -299,7 +303,7 @@ class Refinement:
             correction=correction,
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
-            sheet=candidate.way == "sheet",
+            sheet=candidate.schedule == "sheet",
             band=stage.band,
             seed=self.seed,
         )
@@ -320,7 +324,7 @@ class Refinement:
         """Return the poses of this stage and of those after it that keep its later bounces."""
         kept = itertools.takewhile(lambda stage: stage.beyond == "keep", self.stages[number + 1 :])
         steps = self.stages[number].steps + sum(stage.steps for stage in kept)
-        poses = PLANE_POSES if candidate.way == "planes" else POSES
+        poses = PLANE_POSES if candidate.schedule == "planes" else POSES
         first = candidate.drawn
         drawn = (self.echoes.batch(self.seed, first + step, poses) for step in range(steps))
         return sorted({int(pose) for some in drawn for pose in some})
@@ -329,7 +333,7 @@ class Refinement:
         """Return the correction on a surface; None where it cannot be simulated."""
         training = self.echoes.training
         rng = np.random.default_rng([self.seed, number])
-        numbers = rng.choice(training, min(SIMULATED, len(training)), replace=False)
+        numbers = rng.choice(training, min(CORRECTION_POSES, len(training)), replace=False)
         fine, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
         try:
             simulator = self.simulate(fine)
@@ -354,7 +358,7 @@ class Refinement:
         )
         confidence *= deviation.heard
         values = np.stack([confidence, deviation.error], axis=1)
-        if best and candidate.way != "planes":
+        if best and candidate.schedule != "planes":
             mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(
             mesh=mesh,

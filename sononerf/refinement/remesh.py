@@ -18,10 +18,10 @@ from sononerf.geometry.meshes import Plane
 from sononerf.geometry.raycast import contains
 from sononerf.numerics import Floats, Ints, Singles
 
-BENDING = 0.5
+CURVATURE_LENGTH = 0.5
 """Length over which curvature is averaged, shortest wavelengths."""
 
-TOLERANCE = 0.02
+SOLVER_TOLERANCE = 0.02
 """Relative residual at which the smoothing's conjugate gradients end; a step need not be exact."""
 MOST_ITERATIONS = 200
 """Largest number of iterations of the conjugate gradients; smoothing lengths of a hundred edges
@@ -96,12 +96,12 @@ class MeshOperators:
         direction = residual / diagonal
         inner = (residual * direction).sum(0)
         for _ in range(MOST_ITERATIONS):
-            if bool((residual.square().sum(0) <= TOLERANCE**2 * scale).all()):
+            if bool((residual.square().sum(0) <= SOLVER_TOLERANCE**2 * scale).all()):
                 break
-            turned = apply(direction)
-            along = inner / (direction * turned).sum(0).clamp_min(1e-300)
+            image = apply(direction)
+            along = inner / (direction * image).sum(0).clamp_min(1e-300)
             solution = solution + along * direction
-            residual = residual - along * turned
+            residual = residual - along * image
             conditioned = residual / diagonal
             after = (residual * conditioned).sum(0)
             direction = conditioned + (after / inner.clamp_min(1e-300)) * direction
@@ -181,30 +181,30 @@ def tangents(normals: Tensor) -> tuple[Tensor, Tensor]:
 
 def smoothing_passes(wavelength: float, edge: float) -> int:
     """Return the number of averages of curvature, from wavelength and edge, m."""
-    return max(1, round(2.0 * (BENDING * wavelength / edge) ** 2))
+    return max(1, round(2.0 * (CURVATURE_LENGTH * wavelength / edge) ** 2))
 
 
-CELL = 1.1
+VOXEL_PER_EDGE = 1.1
 """Side of a voxel over the wanted edge: marching cubes then leave as many vertices as even
 triangles of that edge have."""
-BAND = 2
+BAND_VOXELS = 2
 """Number of voxels on each side of the surface for which distances are computed."""
-RELAXING = 8
+RELAXATION_STEPS = 8
 """Number of steps of tangential relaxation; marching cubes leave slivers."""
-RELAXED = 0.7
+RELAXATION = 0.7
 """Fraction of the way to the neighbours' mean that one of these steps moves a vertex."""
-LEAST = 1.5
+MIN_PIECE_SIZE = 1.5
 """Side of the cube with the volume of the smallest piece that is kept, edges. Torn films leave
 smaller crumbs."""
-LOST = 0.01
+MAX_LOST = 0.01
 """Largest fraction of the old surface that may be missing from the new one if it is not blurred, no
 unit. A sheet thinner than a voxel would be lost."""
-THINNED = 0.1
+MAX_LOST_BLURRED = 0.1
 """The same where it is blurred, no unit. A blur of 0.6 wavelengths takes 0.64 of a helix of wire,
 0.02 of a stool and nothing of a cone; a neck between two bodies, which it shall cut, is a few
 hundredths."""
 
-CHORD = 0.005
+CHORD_DEPTH = 0.005
 """Depth of the middles of edges below the smooth surface, shortest wavelengths, above which
 triangles are divided."""
 
@@ -218,11 +218,13 @@ def remesh(
     """
     if not mesh.is_watertight or not len(mesh.faces):
         return None
-    spacing = CELL * edge
+    spacing = VOXEL_PER_EDGE * edge
     whole = mesh if plane is None else plane.with_image(mesh)[0]
     if not whole.is_watertight:
         return None
-    lower, distance = signed_distance(whole, spacing, margin=2 * BAND + round(2 * blur / spacing))
+    lower, distance = signed_distance(
+        whole, spacing, margin=2 * BAND_VOXELS + round(2 * blur / spacing)
+    )
     if blur:
         distance = ndimage.gaussian_filter(distance, blur / spacing)
     if plane is not None:
@@ -235,7 +237,9 @@ def remesh(
     remeshed = level_surface(distance, 0.0, lower, spacing)
     remeshed.merge_vertices()
     pieces = remeshed.split(only_watertight=False)
-    pieces = [piece for piece in pieces if abs(signed_volume(piece)) >= (LEAST * edge) ** 3]
+    pieces = [
+        piece for piece in pieces if abs(signed_volume(piece)) >= (MIN_PIECE_SIZE * edge) ** 3
+    ]
     if not pieces:
         return None
     remeshed = trimesh.util.concatenate(pieces) if len(pieces) > 1 else pieces[0]
@@ -244,18 +248,20 @@ def remesh(
     buried = ndimage.map_coordinates(distance, at, order=1) < -0.5 * spacing
     near = cKDTree(remeshed.vertices).query(old, distance_upper_bound=1.5 * edge + blur)[0]
     area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces, 3), len(old))
-    if np.average(np.isinf(near) & ~buried, weights=area) > (THINNED if blur else LOST):
+    if np.average(np.isinf(near) & ~buried, weights=area) > (
+        MAX_LOST_BLURRED if blur else MAX_LOST
+    ):
         return None
     return relaxed(remeshed)
 
 
-def relaxed(mesh: trimesh.Trimesh, steps: int = RELAXING) -> trimesh.Trimesh:
+def relaxed(mesh: trimesh.Trimesh, steps: int = RELAXATION_STEPS) -> trimesh.Trimesh:
     """Return the mesh with its vertices spread evenly along the surface."""
     faces = np.array(mesh.faces, dtype=np.int64)
     places = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
     operators = MeshOperators(torch.as_tensor(faces), len(places))
     for _ in range(steps):
-        places = operators.relaxed(places, unit(operators.areas(places)), RELAXED)
+        places = operators.relaxed(places, unit(operators.areas(places)), RELAXATION)
     return trimesh.Trimesh(places.numpy(), faces, process=False)
 
 
@@ -275,11 +281,11 @@ def finer(
     places, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     edges, of = np.asarray(mesh.edges_unique), np.asarray(mesh.edges_unique_inverse)
     a, b = edges.T
-    way = places[b] - places[a]
-    to_a = (way * normals[a]).sum(1, keepdims=True)
-    to_b = (way * normals[b]).sum(1, keepdims=True)
+    edge_vector = places[b] - places[a]
+    to_a = (edge_vector * normals[a]).sum(1, keepdims=True)
+    to_b = (edge_vector * normals[b]).sum(1, keepdims=True)
     depth = (to_b * normals[b] - to_a * normals[a]) / 8.0
-    if np.linalg.norm(depth, axis=1).mean() < CHORD * wavelength:
+    if np.linalg.norm(depth, axis=1).mean() < CHORD_DEPTH * wavelength:
         return mesh, values
     vertices = np.concatenate([places, (places[a] + places[b]) / 2.0 + depth])
     faces = np.asarray(mesh.faces)
@@ -305,12 +311,12 @@ def signed_distance(
     bounds = np.asarray(mesh.bounds)
     lower = bounds[0] - margin * spacing
     shape = np.ceil((bounds[1] - bounds[0]) / spacing).astype(int) + 2 * margin + 1
-    distance = np.full(tuple(shape), (BAND + 0.5) * spacing, dtype=np.float32)
+    distance = np.full(tuple(shape), (BAND_VOXELS + 0.5) * spacing, dtype=np.float32)
     for body in mesh.split(only_watertight=False):
         if signed_volume(body) <= 0.0:
             continue
-        first = np.floor((body.bounds[0] - lower) / spacing).astype(int) - BAND - 1
-        last = np.ceil((body.bounds[1] - lower) / spacing).astype(int) + BAND + 2
+        first = np.floor((body.bounds[0] - lower) / spacing).astype(int) - BAND_VOXELS - 1
+        last = np.ceil((body.bounds[1] - lower) / spacing).astype(int) + BAND_VOXELS + 2
         part = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
         found = _of_body(body, lower + first * spacing, tuple(last - first), spacing)
         distance[part] = np.minimum(distance[part], found)
@@ -324,9 +330,9 @@ def _of_body(
     points, normals = _samples(body, 0.5 * spacing)
     near = np.zeros(shape, dtype=bool)
     near[tuple(np.rint((points - lower) / spacing).astype(np.int64).T)] = True
-    near = ndimage.binary_dilation(near, iterations=BAND)
+    near = ndimage.binary_dilation(near, iterations=BAND_VOXELS)
     height = _heights(lower + spacing * np.argwhere(near), points, normals, spacing)
-    farthest = (BAND + 0.5) * spacing
+    farthest = (BAND_VOXELS + 0.5) * spacing
     distance = np.full(shape, farthest, dtype=np.float32)
     distance[near] = np.clip(height, -farthest, farthest)
     # Where the surface crosses itself, planes give wrong signs, and one would empty the whole body.

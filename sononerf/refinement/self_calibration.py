@@ -35,7 +35,7 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.decibels import ACTIVE_DB, compress
 from sononerf.head.head import Head
 from sononerf.numerics import Floats
-from sononerf.refinement.objective import FLOOR_DB, TRUST
+from sononerf.refinement.objective import ERROR_EXPONENT, FLOOR_DB
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.tracer import StillSurface
 
@@ -48,7 +48,7 @@ CUTS = (1.0, 2.0, 3.0)
 """Heights above the first answer at which the upper part begins afterwards, range resolutions.
 Lower is better as long as no part of the image is included; the spread of the answers is the
 uncertainty of the height."""
-NEAR = 3.0
+SEARCH_HALF_WIDTH = 3.0
 """Half width of the second search around the first answer, range resolutions."""
 
 
@@ -84,11 +84,11 @@ def find_support(
 
     middle = low + MIDDLE * (high - low)
     about = search(middle, np.arange(low - 2.0 * step, middle, step), 0.0, 0.4)
-    reach = 2.0 * step * NEAR
+    half_range = 2.0 * step * SEARCH_HALF_WIDTH
     errors_of_heights = []
     for number, cut in enumerate(CUTS):
         begin = about + 2.0 * step * cut
-        heights = np.arange(about - reach, min(begin, about + reach), step)
+        heights = np.arange(about - half_range, min(begin, about + half_range), step)
         share = 0.4 + 0.6 * np.array([number, number + 1]) / len(CUTS)
         errors_of_heights.append(search(begin, heights, *share))
     spread = float(np.std(errors_of_heights, ddof=1))
@@ -106,15 +106,15 @@ def least(values: ArrayLike) -> float:
     return at + (0.5 * (before - after) / bend if math.isfinite(bend) and bend > 0.0 else 0.0)
 
 
-Kind = Literal["gain", "range_offset", "speed_of_sound", "support"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+ErrorKind = Literal["gain", "range_offset", "speed_of_sound", "support"]
+KINDS: tuple[ErrorKind, ...] = get_args(ErrorKind)
 MOST_POSES = 60
 """Number of poses, at most, that are compared. More poses do not help, because the surface is known
 less well than this number of poses determines the errors."""
-GROUPS = 12
+POSE_GROUPS = 12
 """Number of groups of neighbouring poses that give the uncertainties: each hears the surface from
 another side."""
-FARTHER = 4
+MAX_DOUBLINGS = 4
 """Number of times, at most, that a step is doubled while the error falls. Interference makes the
 derivatives of fine cells steep but short, and steps too small."""
 LARGEST_STEP = 0.5
@@ -166,7 +166,7 @@ class Calibrator:
         mesh: trimesh.Trimesh,
         echoes: Echoes,
         optics: Optics,
-        kinds: Sequence[Kind],
+        kinds: Sequence[ErrorKind],
         *,
         dependent: float,
     ) -> None:
@@ -243,7 +243,7 @@ class Calibrator:
             self._go_on(step)
         usual = sums[0] / np.maximum(sums[1], 1.0)
         usual = np.where(sums[1] > 0.0, usual, usual.max())
-        power = np.maximum(usual, 0.25 * np.median(usual)) ** -TRUST
+        power = np.maximum(usual, 0.25 * np.median(usual)) ** -ERROR_EXPONENT
         self.weight = power / power.mean()
         return self.error_db[-1]
 
@@ -367,7 +367,7 @@ class Calibrator:
         """
         away = self.echoes.positions[self.poses] - self.mesh.centroid
         away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        nearest = (away @ fibonacci_sphere(GROUPS).T).argmax(axis=1)
+        nearest = (away @ fibonacci_sphere(POSE_GROUPS).T).argmax(axis=1)
         _, group = np.unique(nearest, return_inverse=True)
         sums = np.zeros((group.max() + 1, slopes.shape[1]))
         np.add.at(sums, group, slopes)
@@ -385,7 +385,7 @@ class Calibrator:
     def _go_on(self, step: Floats) -> None:
         """Repeat a step, each time doubled, as long as the error falls."""
         best, moved, doubled = self.error(), 1.0, 1.0
-        for _ in range(FARTHER):
+        for _ in range(MAX_DOUBLINGS):
             self.stretch = max(self.stretch, moved)
             before = self.values, self.gain
             self._move(step)

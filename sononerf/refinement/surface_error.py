@@ -12,10 +12,11 @@ make them larger by the factor
 (the quotient of Huber's robust covariance [2]_ and the usual one). The variance of the displacement
 over that before anything is heard is :math:`v = 1 / (1 + \sum h)`. The error of a vertex is
 
-.. math:: \epsilon = \text{SCALE}\, \lambda\, u^a\, v^b\, (\text{FLAT} + \lambda\kappa)^c\,
-    (\text{NEAR} + s / \lambda)^e\, d^f
+.. math:: \epsilon = \epsilon_0\, \lambda\, u^a\, v^b\, (\kappa_0 + \lambda\kappa)^c\,
+    (s_0 + s / \lambda)^e\, d^f
 
-with the shortest wavelength :math:`\lambda` and
+with ``ERROR_SCALE``, ``CURVATURE_FLOOR`` and ``DISTANCE_FLOOR`` for :math:`\epsilon_0`,
+:math:`\kappa_0` and :math:`s_0`, the shortest wavelength :math:`\lambda`, and
 
 - the concave curvature :math:`\kappa`: physical optics has no echo between the walls of a hollow;
 - the median distance s of the start surfaces: where they agree, the echoes leave little open;
@@ -51,13 +52,13 @@ from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
 from sononerf.geometry.poses import Poses
 from sononerf.numerics import Bools, Floats, Ints
 from sononerf.progress import Progress
-from sononerf.refinement.objective import Level, differences, measured
+from sononerf.refinement.objective import ErrorLevel, differences, measured
 from sononerf.refinement.optics import Heard, Optics
 from sononerf.refinement.remesh import distance_from, sparse_tensor
 from sononerf.refinement.tracer import StillSurface
 from sononerf.start.surface import Surface
 
-ASKED = 48
+MAX_ERROR_POSES = 48
 """Number of training poses, at most, that are rendered: 3 seconds for three spheres."""
 PROBES = 2
 """Number of random probes per pose; exponents and scale were calibrated with it."""
@@ -66,21 +67,21 @@ SPACING = 1.5
 PRIOR = 0.5
 """Standard deviation of a bump before anything is heard, shortest wavelengths. Twice as much
 changes the area of the sparsification error by 0.002."""
-AROUND = 2.0
+AVERAGING_WIDTH = 2.0
 """Standard deviation of the weights around a vertex over which u is averaged, wavelengths. The
 average lowers the area of the sparsification error from 0.37 to 0.33."""
 EXPONENTS = (0.11, 0.06, 0.14, 0.32, 1.38)
 """Exponents a, b, c, e and f; from `tools/benchmark.py errors --calibrate`, rounded, as is the
 scale."""
-FLAT = 0.05
+CURVATURE_FLOOR = 0.05
 """Curvature times wavelength that is added, no unit: a flat surface has an error too."""
-NEAR = 0.03
+DISTANCE_FLOOR = 0.03
 """Distance of the start surfaces that is added, wavelengths: they may agree by chance."""
-TYPICAL = 0.3
+TYPICAL_DISTANCE = 0.3
 """The same distance where there are no two starts to compare, wavelengths: about their median."""
-SCALE = 0.17
+ERROR_SCALE = 0.17
 """Error of a vertex where all factors are 1, wavelengths."""
-UNHEARD = 0.8
+MAX_VARIANCE = 0.8
 """v above which a vertex is unheard: echoes lower the variance by less than a fifth."""
 TWICE = (-0.47, -0.19)
 """Logarithm of the factor by which twice as many poses change the error of a surface: its value at
@@ -114,17 +115,20 @@ def surface_error(
     bumps, wavelength = Bumps(mesh, optics), optics.wavelength
     misfit = Misfit(bumps, echoes, seed)
     points = bumps.vertices.cpu().numpy()
-    around = _weights(points, points[bumps.centres], AROUND * wavelength)
+    around = _weights(points, points[bumps.centres], AVERAGING_WIDTH * wavelength)
     excess = around @ ((1.0 + misfit.gradient) / (1.0 + misfit.curvature))
     variance = bumps.spread @ (1.0 / (1.0 + misfit.curvature))
-    apart: Floats = np.full(len(points), TYPICAL * wavelength)
+    apart: Floats = np.full(len(points), TYPICAL_DISTANCE * wavelength)
     if len(starts) > 1:
         apart = np.median([distance_from(one, points, 0.5 * wavelength) for one in starts], axis=0)
-    hollow, agreement = FLAT + wavelength * bumps.hollow, NEAR + apart / wavelength
+    hollow, agreement = (
+        CURVATURE_FLOOR + wavelength * bumps.hollow,
+        DISTANCE_FLOOR + apart / wavelength,
+    )
     error_db = np.full(len(points), validation_db)
     factors = np.stack([excess, variance, hollow, agreement, error_db], axis=1)
-    error = SCALE * wavelength * np.prod(factors**EXPONENTS, axis=1)
-    return SurfaceError(error, variance < UNHEARD, factors)
+    error = ERROR_SCALE * wavelength * np.prod(factors**EXPONENTS, axis=1)
+    return SurfaceError(error, variance < MAX_VARIANCE, factors)
 
 
 def error_from_twice(error: float, wavelength: float) -> float:
@@ -193,9 +197,9 @@ class Misfit:
     def __init__(self, bumps: Bumps, echoes: Echoes, seed: int) -> None:
         self.bumps, training, optics = bumps, echoes.training, bumps.optics
         like = optics.get_buffer("wavenumber")
-        self._level = Level(optics.ears, len(optics.frequencies), like)
+        self._level = ErrorLevel(optics.ears, len(optics.frequencies), like)
         rng = np.random.default_rng(seed)
-        chosen = rng.choice(training, min(ASKED, len(training)), replace=False)
+        chosen = rng.choice(training, min(MAX_ERROR_POSES, len(training)), replace=False)
         self._random = torch.Generator().manual_seed(seed)
         gradient, curvature = torch.zeros(2, len(bumps.centres), dtype=torch.float64)
         square, count = 0.0, 0
@@ -244,8 +248,8 @@ class Misfit:
         derivatives = torch.zeros(moves.shape, dtype=torch.float64)
         for _ in range(PROBES):
             signs = torch.randint(0, 2, off.shape, generator=self._random) * 2 - 1
-            ways = weight.sqrt() * signs.to(off)
-            (slope,) = torch.autograd.grad((off * ways).sum(), moves, retain_graph=True)
+            probe = weight.sqrt() * signs.to(off)
+            (slope,) = torch.autograd.grad((off * probe).sum(), moves, retain_graph=True)
             derivatives += slope.cpu().square() / PROBES
         return derivatives
 
@@ -277,7 +281,7 @@ around, between the least and the greatest distance of the poses."""
 CANDIDATES = 300
 """Number of candidates: on a sphere they are 12 degrees apart."""
 
-SPREAD = 0.7
+MIN_POSE_GAP = 0.7
 """Least gap between a chosen pose and all others; the unit is the greatest gap of a candidate.
 Where a surface is wrong, so are the directions of its mirrors, and poses far apart serve better."""
 
@@ -339,15 +343,20 @@ def next_poses(
     )
     weight = bumps.spread.T @ (corners * surface.error)
     middle = mesh.bounds.mean(axis=0)
-    ways, heard = (
+    directions, heard = (
         out / np.linalg.norm(out, axis=1, keepdims=True)
         for out in (candidates.positions - middle, echoes.positions[echoes.training] - middle)
     )
-    return candidates[_greedy(weight, 1.0 + misfit.curvature, added, count, ways, heard)]
+    return candidates[_greedy(weight, 1.0 + misfit.curvature, added, count, directions, heard)]
 
 
 def _greedy(
-    weight: Floats, information: Floats, added: Floats, count: int, ways: Floats, heard: Floats
+    weight: Floats,
+    information: Floats,
+    added: Floats,
+    count: int,
+    directions: Floats,
+    heard: Floats,
 ) -> list[int]:
     """Return the rows of ``added`` (P, B) that reduce the sum of weight / sqrt(known) most.
 
@@ -355,14 +364,14 @@ def _greedy(
     """
     chosen: list[int] = []
     error = weight * np.sqrt(information)  # error = weight where nothing is added
-    gap, _ = cKDTree(heard).query(ways)
+    gap, _ = cKDTree(heard).query(directions)
     for _ in range(count):
         after = (error / np.sqrt(information + added)).sum(axis=1)
-        left = gap >= SPREAD * gap.max()
+        left = gap >= MIN_POSE_GAP * gap.max()
         left[chosen] = False
         best = int(np.where(left, after, np.inf).argmin())
         chosen.append(best)
-        gap = np.minimum(gap, np.linalg.norm(ways - ways[best], axis=1))
+        gap = np.minimum(gap, np.linalg.norm(directions - directions[best], axis=1))
         information = information + added[best]
     return chosen
 
@@ -371,18 +380,18 @@ def _candidates(surface: Surface, echoes: Echoes, within: Within, count: int, se
     middle = surface.mesh.bounds.mean(axis=0)
     out = echoes.positions[echoes.training] - middle
     distance = np.linalg.norm(out, axis=1)
-    ways: Floats = fibonacci_sphere(count)
+    directions: Floats = fibonacci_sphere(count)
     far: Floats = np.full(count, np.median(distance))
     if within == "cap":
         axis = (out / distance[:, None]).mean(axis=0)
         axis /= max(float(np.linalg.norm(axis)), 1e-12)
         widest = float(np.arccos(np.clip(out @ axis / distance, -1.0, 1.0)).max())
         half = min(widest, math.pi)
-        ways = fibonacci_cap(count, axis=axis, half_angle=half, offset=(0.5, 0.0))
+        directions = fibonacci_cap(count, axis=axis, half_angle=half, offset=(0.5, 0.0))
     if within == "volume":
         depth = np.random.default_rng(seed).random(count)
         far = np.cbrt(distance.min() ** 3 + depth * (distance.max() ** 3 - distance.min() ** 3))
-    return Poses.looking_at(middle + far[:, None] * ways, middle)
+    return Poses.looking_at(middle + far[:, None] * directions, middle)
 
 
 def _check(candidates: Poses, surface: Surface, echoes: Echoes) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.numerics import Bools, Floats, Ints, Singles
-from sononerf.refinement.optics import SILENT, Heads, Heard, Optics, Pieces
+from sononerf.refinement.optics import SILENT_EXPONENT, Heads, Heard, Optics, Pieces
 from sononerf.refinement.remesh import MeshOperators, smoothing_passes, unit
 from sononerf.resources import computed
 from sononerf.scene.scene import Scene
@@ -27,7 +27,7 @@ from sononerf.simulation.simulator import Simulator, useful_workers
 if TYPE_CHECKING:
     from sononerf.refinement.optics import Optics
 
-FREE = 0.25
+FREE_DISTANCE = 0.25
 """Distance in front of a piece within which nothing hides it, shortest wavelengths. Objects so
 close throw no shadow, and the other side of a thin sheet that was pushed through must not hide
 it."""
@@ -92,7 +92,7 @@ def _candidates(
     exponent = optics.near_mirror(
         points[vertex], area[vertex], bending[vertex], emitters[pose], middles[pose]
     )[4]
-    heard = exponent < SILENT
+    heard = exponent < SILENT_EXPONENT
     return pose[heard], vertex[heard]
 
 
@@ -107,7 +107,7 @@ def _visible(
     ears: Tensor,
 ) -> Tensor:
     """Visibility of candidates from emitter and ears, (Q, E) float32, softened by neighbours."""
-    free = FREE * optics.wavelength
+    free = FREE_DISTANCE * optics.wavelength
     points = vertices[vertex].detach().cpu().numpy()
     of = pose.cpu().numpy()
     sources, places = emitters.detach().cpu().numpy(), ears.detach().cpu().numpy()
@@ -188,7 +188,7 @@ BOUNCES = 3
 """Number of bounces, the simulator's default; later ones are faint."""
 LATER_RAYS = 4_000
 """Number of rays per pose for later bounces; only their power is used."""
-FAINT = 3e-3
+MIN_LATER_ECHO = 3e-3
 """Magnitude over the strongest below which echoes are left out: -50 dB."""
 
 
@@ -265,7 +265,7 @@ class _Collected:
             return Later(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, nodes), np.float32))
         ear, delay, weight = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
         loud = weight.max(axis=1)
-        kept = loud > FAINT * loud.max(initial=0.0)
+        kept = loud > MIN_LATER_ECHO * loud.max(initial=0.0)
         return Later(ear[kept], delay[kept], weight[kept])
 
 

@@ -193,10 +193,10 @@ class Page:
         from trimesh.exchange.gltf import export_glb
         from trimesh.viewer.notebook import scene_to_html
 
-        turned = {name: mesh.copy() for name, mesh in meshes.items()}
-        for mesh in turned.values():
+        copies = {name: mesh.copy() for name, mesh in meshes.items()}
+        for mesh in copies.values():
             mesh.apply_transform(_camera_frame())
-        scenes = {name: trimesh.Scene([mesh]) for name, mesh in turned.items()}
+        scenes = {name: trimesh.Scene([mesh]) for name, mesh in copies.items()}
         for scene in scenes.values():
             _ = scene.camera  # made at first use; the viewer needs the one in the file
         first = next(iter(scenes.values()))

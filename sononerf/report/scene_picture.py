@@ -45,7 +45,7 @@ LOOK = 0.045
 
 def scene_png(
     mesh: trimesh.Trimesh,
-    poses_positions: ArrayLike,
+    positions: ArrayLike,
     poses_forward: ArrayLike,
     region_box: tuple[ArrayLike, ArrayLike] | None = None,
     *,
@@ -55,10 +55,10 @@ def scene_png(
 ) -> bytes:
     """Draw a scene with where the calls come from and where they go.
 
-    In: poses_positions ((P, 3), m), poses_forward (P, 3), region_box (((3,), (3,)), m), split (P,),
+    In: positions ((P, 3), m), poses_forward (P, 3), region_box (((3,), (3,)), m), split (P,),
     size (int, int), view (3,).
     """
-    heads = np.asarray(poses_positions, dtype=np.float64).reshape(-1, 3)
+    heads = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     looks = np.asarray(poses_forward, dtype=np.float64).reshape(-1, 3)
     kinds = np.zeros(len(heads), dtype=np.int64) if split is None else np.asarray(split)
     if not len(mesh.faces):

@@ -150,13 +150,13 @@ class Viewer:
         with_onset = np.flatnonzero(np.isfinite(hull.first).any(axis=1))
         if not len(with_onset):
             return
-        trusted = np.asarray(np.isfinite(hull.trusted[with_onset]).any(axis=1))
+        inlier_onsets = np.asarray(np.isfinite(hull.inlier_onsets[with_onset]).any(axis=1))
         # Drawn straight ahead, because an onset has a range and no direction.
         at = (
             hull.sources[with_onset]
             + hull.axes[with_onset] * hull.first[with_onset].max(axis=1)[:, None]
         )
-        colours = np.where(trusted[:, None], (30, 120, 30), (220, 0, 160)).astype(np.uint8)
+        colours = np.where(inlier_onsets[:, None], (30, 120, 30), (220, 0, 160)).astype(np.uint8)
         points = self.server.scene.add_point_cloud(
             "/onsets",
             at.astype(np.float32),
@@ -233,11 +233,11 @@ class Viewer:
         x, y, z = DEFAULT_VIEW
         away = np.array([x + y, y - x, 2.0 * z])  # to the left of where the camera begins
         away = self._centre + away * self._span / np.linalg.norm(away)
-        turned = Poses.looking_at(away[None], self._centre).rotations
+        rotation = Poses.looking_at(away[None], self._centre).rotations
         self.head = self.server.scene.add_transform_controls(
             "/head",
             scale=0.35 * self._span,
-            wxyz=_quaternions(turned)[0],
+            wxyz=_quaternions(rotation)[0],
             position=away,
             depth_test=False,
         )

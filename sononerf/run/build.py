@@ -151,7 +151,7 @@ def head_of(settings: Settings) -> Head:
         ears=settings.ears,
         call=settings.call,
         air=settings.air,
-        analysis=settings.spectrogram,
+        spectrogram=settings.spectrogram,
         noise=settings.noise,
         support=settings.support,
     )

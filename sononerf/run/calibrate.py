@@ -30,8 +30,8 @@ from sononerf.refinement.self_calibration import (
     KINDS,
     Calibration,
     Calibrator,
+    ErrorKind,
     Estimate,
-    Kind,
     above,
     find_support,
     with_support,
@@ -66,8 +66,8 @@ def write_corrected(
     with storage.lock(output):
         made = EnsembleStore.create(
             output,
-            poses_positions=store.positions,
-            poses_rotations=store.rotations,
+            positions=store.positions,
+            rotations=store.rotations,
             split=store.split,
             range=axis,
             frequency=store.frequency,
@@ -131,15 +131,15 @@ def _fingerprint(calibration: Calibration, head: Head) -> str:
     return hashlib.sha256(np.round(values, 9).astype("<f8").tobytes()).hexdigest()[:12]
 
 
-STEPS = 20
+MAX_STEPS = 20
 """Largest number of Gauss-Newton steps; they usually end earlier."""
-SETTLED = 0.1
+CONVERGED = 0.1
 """Length of a step, standard deviations, below which the iteration ends."""
-DETERMINED = 0.25
+MAX_LENGTH_ERROR = 0.25
 """Largest uncertainty of a length, range resolutions, at which an error counts as found."""
-DETERMINED_DB = 1.0
-"""DETERMINED of a gain, dB."""
-DETERMINED_RESOLUTIONS = 1.0
+MAX_GAIN_ERROR_DB = 1.0
+"""MAX_LENGTH_ERROR of a gain, dB."""
+MAX_HEIGHT_ERROR = 1.0
 """Largest uncertainty of the support's height, range resolutions, at which it counts as found."""
 ON_CYLINDER = 0.02
 """Largest range of the poses' distances from the axis of a turntable, over their mean."""
@@ -155,7 +155,7 @@ class Calibrated:
     warnings: list[str]  # Errors that the echoes do not determine
 
 
-def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
+def kinds_of(names: Sequence[str]) -> tuple[ErrorKind, ...]:
     """Return the kinds of errors by name."""
     unknown = [name for name in names if name not in KINDS]
     if unknown or not names:
@@ -193,7 +193,9 @@ def calibrate(
     estimate.deviation.update(bounds)
     corrected = write_corrected(echoes, output, estimate.calibration, progress)
     return Calibrated(
-        corrected, estimate, *describe(echoes.head, echoes.store, mesh, estimate, parameters)
+        corrected,
+        estimate,
+        *describe_estimate(echoes.head, echoes.store, mesh, estimate, parameters),
     )
 
 
@@ -221,37 +223,39 @@ def _with_support(
 
 
 def _estimate(
-    echoes: Echoes, mesh: trimesh.Trimesh, kinds: Sequence[Kind], progress: Progress
+    echoes: Echoes, mesh: trimesh.Trimesh, kinds: Sequence[ErrorKind], progress: Progress
 ) -> Estimate:
     head = echoes.head
     if not kinds:
         nothing = np.zeros((len(head.receivers), len(head.frequency)))
         return Estimate(Calibration(nothing), {}, [])
-    work = Calibrator(mesh, echoes, Optics(head), kinds, dependent=dependent_cells(head.analysis))
-    with progress.task("calibrating", STEPS * len(work.poses)) as task:
-        for _ in range(STEPS):
+    work = Calibrator(
+        mesh, echoes, Optics(head), kinds, dependent=dependent_cells(head.spectrogram)
+    )
+    with progress.task("calibrating", MAX_STEPS * len(work.poses)) as task:
+        for _ in range(MAX_STEPS):
             work.step(task.advance)
-            if work.change < SETTLED:
+            if work.change < CONVERGED:
                 break
     return work.result()
 
 
-def dependent_cells(analysis: SpectrogramSettings) -> float:
+def dependent_cells(spectrogram: SpectrogramSettings) -> float:
     """Return how many cells of a spectrogram share their noise, no unit, 1 or more."""
-    frequency = np.linspace(analysis.frequency_min, analysis.frequency_max, 64)
-    duration, bandwidth = (part.mean() for part in row_widths(analysis, frequency))
+    frequency = np.linspace(spectrogram.frequency_min, spectrogram.frequency_max, 64)
+    duration, bandwidth = (part.mean() for part in row_widths(spectrogram, frequency))
     rows = (
-        analysis.channels
-        if analysis.kind == "gammatone"
-        else (analysis.frequency_max - analysis.frequency_min)
-        / (analysis.sampling_rate / analysis.fft)
+        spectrogram.channels
+        if spectrogram.kind == "gammatone"
+        else (spectrogram.frequency_max - spectrogram.frequency_min)
+        / (spectrogram.sampling_rate / spectrogram.fft)
     )
-    spacing = (analysis.frequency_max - analysis.frequency_min) / rows
-    slices = duration * analysis.sampling_rate / analysis.hop
+    spacing = (spectrogram.frequency_max - spectrogram.frequency_min) / rows
+    slices = duration * spectrogram.sampling_rate / spectrogram.hop
     return max(float(slices * bandwidth / spacing), 1.0)
 
 
-def describe(
+def describe_estimate(
     head: Head, store: Ensemble, mesh: trimesh.Trimesh, estimate: Estimate, kinds: Sequence[str]
 ) -> tuple[list[str], list[str]]:
     """Return results and undetermined errors, one line each."""
@@ -272,12 +276,12 @@ def describe(
         uncertain = DECIBELS * deviation["gain"]
         gains = ", ".join(f"{DECIBELS * value:+.2f}" for value in calibration.gain.mean(axis=1))
         text = f"{gains} dB in the mean over frequency, each ± {uncertain:.2f} dB"
-        vague = uncertain > DETERMINED_DB
+        vague = uncertain > MAX_GAIN_ERROR_DB
         say("gain", text, "the echoes do not determine it", vague=vague)
     if "range_offset" in kinds:
         uncertain = deviation["range_offset"]
         text = f"{1e3 * calibration.range_offset:+.2f} ± {1e3 * uncertain:.2f} mm"
-        vague = uncertain > DETERMINED * head.resolution
+        vague = uncertain > MAX_LENGTH_ERROR * head.resolution
         warning = "the echoes do not separate it from the size of the object"
         say("range_offset", text, warning, vague=vague)
     if "range_offset" in kinds and _is_turntable(store.positions):
@@ -295,12 +299,12 @@ def describe(
         height = float(np.dot(head.plane.point, head.plane.normal))
         uncertain = deviation["support"]
         text = f"{1e3 * height:.1f} ± {1e3 * uncertain:.1f} mm"
-        vague = uncertain > DETERMINED_RESOLUTIONS * head.resolution
+        vague = uncertain > MAX_HEIGHT_ERROR * head.resolution
         say("support", text, "the echoes hardly determine it; measure it", vague=vague)
     if "speed_of_sound" in kinds:
         uncertain, speed = deviation["speed_of_sound"], head.speed_of_sound
         text = f"{speed * math.exp(calibration.speed_of_sound):.2f} ± {speed * uncertain:.2f} m/s"
-        vague = uncertain * distance.mean() > DETERMINED * head.resolution
+        vague = uncertain * distance.mean() > MAX_LENGTH_ERROR * head.resolution
         warning = (
             "all poses are at one distance, so it cannot be separated from the size of the "
             "object; record from several distances"

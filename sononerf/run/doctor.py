@@ -43,7 +43,7 @@ class Finding:
     """Result of one check."""
 
     name: str  # Its name
-    found: str  # The finding
+    value: str  # The finding
     good: bool = True  # True if there is no problem
     remedy: str = ""  # Advice on how to get a missing item; empty if nothing is missing
 
@@ -75,7 +75,7 @@ def as_lines(findings: list[Finding]) -> list[str]:
     lines = [f"     {'sononerf':<{width}}  {__version__}"]
     for finding in findings:
         mark = "ok  " if finding.good else "lack"
-        lines.append(f"{mark} {finding.name:<{width}}  {finding.found}")
+        lines.append(f"{mark} {finding.name:<{width}}  {finding.value}")
         if finding.remedy:
             lines.append(f"     {'':<{width}}  -> {finding.remedy}")
     return lines
@@ -113,9 +113,9 @@ def _gpu() -> Finding:
     import torch
 
     if torch.cuda.is_available():
-        found = torch.cuda.get_device_properties(0)
+        value = torch.cuda.get_device_properties(0)
         count = torch.cuda.device_count()
-        text = f"{count} x {found.name}, {found.total_memory / 1e9:.0f} GB"
+        text = f"{count} x {value.name}, {value.total_memory / 1e9:.0f} GB"
         return Finding("gpu", text)
     if torch.backends.mps.is_available():
         return Finding("gpu", "Apple's has no double precision; everything runs on the CPU")

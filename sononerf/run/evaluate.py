@@ -24,7 +24,7 @@ from sononerf.evaluation.baseline import BASELINES, backprojection
 from sononerf.evaluation.numbers import (
     Comparison,
     Evaluation,
-    Kind,
+    RegistrationKind,
     Truth,
     added_part,
     baseline_volume,
@@ -59,7 +59,7 @@ def evaluate(
     run: Path | Run,
     *,
     truth: Path | None = None,
-    registration: Kind | None = None,
+    registration: RegistrationKind | None = None,
     unit: Unit | None = None,
     frame: FrameName | None = None,
     progress: Progress | None = None,
@@ -155,11 +155,11 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
 
 logger = logging.getLogger("sononerf")
 
-HEARING = ("air", "ears", "call", "spectrogram")
+HEAD_SECTIONS_COMPARED = ("air", "ears", "call", "spectrogram")
 """Sections in which two runs must agree; otherwise the listeners differ, not the scenes."""
 VOXELS = 80
 """Number of voxels along the longest side."""
-WRONG_WAY = 2.0
+SWAPPED_RATIO = 2.0
 """Excess of the second run over the first, relative to that of the first over the second, from
 which the runs look swapped."""
 MOST_POSES = 400
@@ -238,7 +238,7 @@ def compare_runs_of(
     one, other = (_heard(each, poses, reference, *box, accelerator, progress) for each in runs)
     comparison = compare_volumes(one, other)
     missing = -float(comparison.difference.values.min())
-    if missing > WRONG_WAY * comparison.score:
+    if missing > SWAPPED_RATIO * comparison.score:
         logger.warning(
             "the second run has up to %.2f of the maximum that the first has not: the runs look "
             "swapped; pass the run with the target first",
@@ -251,7 +251,7 @@ def _check_alike(first: Run, second: Run) -> None:
     differing = [
         key
         for key in differing_keys(first.settings, second.settings)
-        if key.split(".")[0] in HEARING
+        if key.split(".")[0] in HEAD_SECTIONS_COMPARED
     ]
     if differing:
         keys = ", ".join(differing)

@@ -149,7 +149,7 @@ def _content(source: Path, suffix: str, what: What, frame: Frame) -> bytes:
     return file_bytes(ARRAYS[suffix], arrays, plain)
 
 
-Part = tuple[dict[str, Named], dict[str, str]]
+Arrays = tuple[dict[str, Named], dict[str, str]]
 
 
 def _axes(range_m: NDArray[Any], frequency: NDArray[Any]) -> dict[str, Named]:
@@ -160,14 +160,14 @@ def _axes(range_m: NDArray[Any], frequency: NDArray[Any]) -> dict[str, Named]:
 
 
 def _poses(position: NDArray[Any], rotation: NDArray[Any], frame: Frame) -> dict[str, Named]:
-    places, turned = frame.places(position), frame.rotations(rotation)
+    places, rotations = frame.places(position), frame.rotations(rotation)
     return {
         "position": Named(places, ("pose", "world"), frame.unit_name, "position of the head"),
-        "rotation": Named(turned, ("pose", "world", "head"), "", "rotation from head to world"),
+        "rotation": Named(rotations, ("pose", "world", "head"), "", "rotation from head to world"),
     }
 
 
-def _echoes(source: Path, frame: Frame) -> Part:
+def _echoes(source: Path, frame: Frame) -> Arrays:
     store = complete_store(source)
     loud = np.stack([store.read_pose(index) for index in range(len(store))])
     attributes = store.attributes
@@ -186,7 +186,7 @@ def _echoes(source: Path, frame: Frame) -> Part:
     }
 
 
-def _prediction(source: Path, frame: Frame) -> Part:
+def _prediction(source: Path, frame: Frame) -> Arrays:
     file = source / "prediction" / "spectrograms.npz"
     if not file.is_file():
         raise InputError(f"{file}: missing; make it with `sononerf predict {source}`")
@@ -224,7 +224,7 @@ def read_volume(source: Path) -> Volume:
         raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
 
 
-def _volume(source: Path, frame: Frame) -> Part:
+def _volume(source: Path, frame: Frame) -> Arrays:
     if not frame.is_world:
         raise InputError(f"{source}: a volume is exported in the world's frame; add --frame world")
     volume = read_volume(source)

@@ -24,54 +24,54 @@ from sononerf.head.call import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.numerics import Singles
 from sononerf.progress import Progress, duration
-from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
+from sononerf.recordings.pose_check import MAX_PINGS, Verdict, alternatives, check_poses, shifted
 from sononerf.recordings.pose_tables import original_frame
 from sononerf.recordings.recording import Channel, faults_of_channels
 from sononerf.report.spectrogram_picture import pings_png
-from sononerf.run.understand import Understood, understand
+from sononerf.run.import_plan import ImportPlan, plan_import
 from sononerf.settings.loading import assignments
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
 
 logger = logging.getLogger("sononerf")
 
-SHOWN = 3  # pings in a picture
+SHOWN_PINGS = 3  # pings in a picture
 NOT_HASHED = ("source", "licence")
 """Keys that do not change the echoes."""
 WRITTEN_SECONDS = 0.01
 """Time to write one ping durably, s, on a usual disk."""
-COARSER = 1.5
+MIN_COMPRESSION_GAIN = 1.5
 """Range resolution over that of an impulse, no unit, from which pulse compression is proposed; a
 smaller gain would hardly be seen."""
 
 
-def echo_hash(understood: Understood) -> str:
+def import_hash(plan: ImportPlan) -> str:
     """Return a hash of all that the echoes come from: samples, poses, settings."""
-    plain = understood.settings.plain()
-    digest = hashlib.sha256(f"recordings {understood.form}".encode())
-    given = understood.wanted.model_dump(mode="json", exclude=set(NOT_HASHED))
+    plain = plan.settings.plain()
+    digest = hashlib.sha256(f"recordings {plan.form}".encode())
+    given = plan.options.model_dump(mode="json", exclude=set(NOT_HASHED))
     sections = {name: plain[name] for name in HEAD_SECTIONS}
     # Newer keys that do not apply leave the hash as older versions made it.
-    if understood.head.plane is None:
+    if plan.head.plane is None:
         del sections["support"]
     if given["turntable"] is not None and given["turntable"]["surface"] is None:
         del given["turntable"]["surface"]
-    digest.update(json.dumps([given, sections, understood.calibration], sort_keys=True).encode())
-    poses = understood.poses[understood.pings]
+    digest.update(json.dumps([given, sections, plan.calibration], sort_keys=True).encode())
+    poses = plan.poses[plan.pings]
     for values in (poses.positions, poses.rotations):
         digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())
-    digest.update(understood.split.tobytes())
-    digest.update(understood.pings.astype("<i8").tobytes())
-    digest.update(np.round(understood.recording.emission, 12).astype("<f8").tobytes())
-    digest.update(understood.cutter.digest(understood.head.samples))
-    if understood.cutter.background is not None:
-        digest.update(np.round(understood.cutter.background, 9).astype("<f8").tobytes())
+    digest.update(plan.split.tobytes())
+    digest.update(plan.pings.astype("<i8").tobytes())
+    digest.update(np.round(plan.recording.emission, 12).astype("<f8").tobytes())
+    digest.update(plan.cutter.digest(plan.head.samples))
+    if plan.cutter.background is not None:
+        digest.update(np.round(plan.cutter.background, 9).astype("<f8").tobytes())
     return digest.hexdigest()
 
 
-def spectrogram_of(understood: Understood, ping: int) -> Singles:
+def spectrogram_of(plan: ImportPlan, ping: int) -> Singles:
     """Return the spectrogram of one ping of the recording, (E, R, F)."""
-    head = understood.head
-    return head.analyse(understood.cutter.echo(ping, head.samples)).astype(np.float32)
+    head = plan.head
+    return head.analyse(plan.cutter.echo(ping, head.samples)).astype(np.float32)
 
 
 def read_recordings(
@@ -107,71 +107,71 @@ def read_recordings(
     output = Path(output)
     chosen = assignments(options or {})
     progress = progress or Progress()
-    understood = understand(
+    plan = plan_import(
         form, Path(source), output, settings_file=settings_file, overrides=chosen, progress=progress
     )
-    store, found = import_understood(understood, output, progress=progress)
+    store, found = write_import(plan, output, progress=progress)
     if found.message:
         logger.warning("%s", found.message)
-    return Echoes(store, understood.head)
+    return Echoes(store, plan.head)
 
 
-def import_understood(
-    understood: Understood, output: Path, *, progress: Progress | None = None
+def write_import(
+    plan: ImportPlan, output: Path, *, progress: Progress | None = None
 ) -> tuple[EnsembleStore, Verdict]:
     """Write the store, and report the check of the poses by first echoes."""
     progress = progress or Progress(quiet=True)
-    echoes_id = echo_hash(understood)
+    echoes_id = import_hash(plan)
     if (output / "zarr.json").is_file():
         store = EnsembleStore.open(output)
-        if store.attributes.get("echo_hash") != echoes_id:
+        if store.attributes.get("import_hash") != echoes_id:
             raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
         if store.is_sealed and not store.damaged():
-            return store, verdict(understood, store)
-    warn_of_call(understood.settings.call, understood.settings.spectrogram)
-    poses = understood.poses[understood.pings]
+            return store, verdict(plan, store)
+    warn_of_call(plan.settings.call, plan.settings.spectrogram)
+    poses = plan.poses[plan.pings]
     storage.probe_writable(output)
     with storage.lock(output):
         store = EnsembleStore.create(
             output,
-            poses_positions=poses.positions,
-            poses_rotations=poses.rotations,
-            split=understood.split,
-            range=understood.head.range,
-            frequency=understood.head.frequency,
-            attributes=_attributes(understood, echoes_id),
-            receivers=len(understood.head.receivers),
+            positions=poses.positions,
+            rotations=poses.rotations,
+            split=plan.split,
+            range=plan.head.range,
+            frequency=plan.head.frequency,
+            attributes=_attributes(plan, echoes_id),
+            receivers=len(plan.head.receivers),
         )
         store.remove_damaged()
-        attach(understood.settings, output)
+        attach(plan.settings, output)
         missing = store.missing()
         with progress.task("importing", len(missing)) as task:
             for index in missing:
-                store.write_pose(index, spectrogram_of(understood, int(understood.pings[index])))
+                store.write_pose(index, spectrogram_of(plan, int(plan.pings[index])))
                 task.advance()
         silent = f"{output}: all recordings are silent; check the channels"
-        seal_recorded(store, understood.head, poses, understood.split, silent=silent)
+        seal_recorded(store, plan.head, poses, plan.split, silent=silent)
     store = EnsembleStore.open(output)
-    return store, verdict(understood, store)
+    return store, verdict(plan, store)
 
 
-def _attributes(understood: Understood, echoes_id: str) -> dict[str, Any]:
-    plain = understood.settings.plain()
+def _attributes(plan: ImportPlan, echoes_id: str) -> dict[str, Any]:
+    plain = plan.settings.plain()
     return {
-        "echo_hash": echoes_id,
+        "import_hash": echoes_id,
         "origin": "recorded",
-        "format": understood.form,
-        "source": understood.wanted.source or understood.recording.path.name,
-        "licence": understood.wanted.licence,
+        "format": plan.form,
+        "source": plan.options.source or plan.recording.path.name,
+        "licence": plan.options.licence,
         "settings": {name: plain[name] for name in HEAD_SECTIONS},
-        "import": understood.wanted.model_dump(mode="json"),
-        **original_frame(understood.recording.columns, understood.wanted),
-        "calibration": understood.calibration,
-        "rejected_clipped": understood.clipped,
-        "speed_of_sound": understood.head.speed_of_sound,
+        "import": plan.options.model_dump(mode="json"),
+        **original_frame(plan.recording.columns, plan.options),
+        "calibration": plan.calibration,
+        "rejected_clipped": plan.clipped,
+        "speed_of_sound": plan.head.speed_of_sound,
         "units": {
             "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m"
-            if understood.wanted.reference is not None
+            if plan.options.reference is not None
             else "linear magnitude, unit of the recording",
             "position": "m",
             "range": "m",
@@ -181,85 +181,86 @@ def _attributes(understood: Understood, echoes_id: str) -> dict[str, Any]:
     }
 
 
-def verdict(understood: Understood, store: EnsembleStore) -> Verdict:
+def verdict(plan: ImportPlan, store: EnsembleStore) -> Verdict:
     """Return the check of pose conventions by the first echoes of the training poses."""
-    heard = Echoes(store, understood.head).onsets
-    table, pings = understood.recording.columns, understood.pings[heard.poses]
-    others = alternatives(table.take(pings), understood.wanted)
+    heard = Echoes(store, plan.head).onsets
+    table, pings = plan.recording.columns, plan.pings[heard.poses]
+    others = alternatives(table.take(pings), plan.options)
     return check_poses(
         heard.first,
-        understood.poses[understood.pings[heard.poses]],
-        others | shifted(table, pings, understood.wanted),
-        emitter=understood.head.emitter,
-        receivers=understood.head.receivers,
-        resolution=understood.head.resolution,
+        plan.poses[plan.pings[heard.poses]],
+        others | shifted(table, pings, plan.options),
+        emitter=plan.head.emitter,
+        receivers=plan.head.receivers,
+        resolution=plan.head.resolution,
     )
 
 
-def check_before(understood: Understood, *, progress: Progress | None = None) -> Verdict:
+def check_before(plan: ImportPlan, *, progress: Progress | None = None) -> Verdict:
     """Return the verdict on the poses without making a store."""
-    train = np.flatnonzero(understood.split == 0)
-    chosen = train[np.linspace(0, len(train) - 1, min(MOST, len(train))).round().astype(int)]
-    part = replace(understood, pings=understood.pings[chosen], split=understood.split[chosen])
+    train = np.flatnonzero(plan.split == 0)
+    chosen = train[np.linspace(0, len(train) - 1, min(MAX_PINGS, len(train))).round().astype(int)]
+    part = replace(plan, pings=plan.pings[chosen], split=plan.split[chosen])
     with tempfile.TemporaryDirectory() as folder:
-        return import_understood(part, Path(folder) / "store", progress=progress)[1]
+        return write_import(part, Path(folder) / "store", progress=progress)[1]
 
 
-def describe(understood: Understood) -> list[str]:
+def describe_plan(plan: ImportPlan) -> list[str]:
     """Return the interpretation of the recordings, one line each."""
-    settings, analysis = understood.settings, understood.settings.spectrogram
-    poses = understood.poses[understood.pings]
+    settings, spectrogram = plan.settings, plan.settings.spectrogram
+    poses = plan.poses[plan.pings]
     lower, upper = poses.positions.min(axis=0), poses.positions.max(axis=0)
-    axis, frequency = understood.head.range, understood.head.frequency
-    units = understood.recording.columns.units
+    axis, frequency = plan.head.range, plan.head.frequency
+    units = plan.recording.columns.units
     said = ", ".join(sorted({f"{kind} in {unit}" for kind, unit in _kinds(units).items()}))
-    counts = np.bincount(understood.split, minlength=3)
+    counts = np.bincount(plan.split, minlength=3)
     call = settings.call
     bands = ", ".join(f"{a / 1e3:g} to {b / 1e3:g} kHz" for a, b in call.bands.values())
-    frame = "turntable" if understood.wanted.turntable is not None else understood.wanted.frame
-    shortest, longest = (f"{1e3 * each:.4g}" for each in understood.lengths)
+    frame = "turntable" if plan.options.turntable is not None else plan.options.frame
+    shortest, longest = (f"{1e3 * each:.4g}" for each in plan.lengths)
     lengths = f"{shortest} ms" if shortest == longest else f"{shortest} to {longest} ms"
-    recording = understood.recording
+    recording = plan.recording
     lines = [
-        f"source:     {recording.path} ({understood.form}), {recording.sampling_rate:g} Hz",
+        f"source:     {recording.path} ({plan.form}), {recording.sampling_rate:g} Hz",
         f"pings:      {len(recording)} read, {lengths} each, "
-        f"{understood.clipped} clipped and rejected; "
+        f"{plan.clipped} clipped and rejected; "
         f"{counts[0]} train, {counts[1]} validation, {counts[2]} test",
-        f"receivers:  {len(understood.head.receivers)}, {settings.ears.directivity}",
+        f"receivers:  {len(plan.head.receivers)}, {settings.ears.directivity}",
         f"poses:      frame {frame}{'; ' + said if said else ''}; x {lower[0]:.3f} to "
         f"{upper[0]:.3f}, y {lower[1]:.3f} to {upper[1]:.3f}, z {lower[2]:.3f} to "
         f"{upper[2]:.3f} m",
         f"call:       {call.kind}{', ' + bands if bands else ''}"
-        f"{', by pulse compression' if understood.wanted.compress else ''}",
-        f"air:        {understood.head.speed_of_sound:.1f} m/s",
+        f"{', by pulse compression' if plan.options.compress else ''}",
+        f"air:        {plan.head.speed_of_sound:.1f} m/s",
         f"range:      {axis[0]:.3f} to {axis[-1]:.3f} m in {len(axis)} slices of "
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
         f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
-        f"{len(frequency)} bins (window {analysis.window}, hop {analysis.hop}, fft {analysis.fft})",
-        _cost_line(understood),
-        *(_channel_line(number, channel) for number, channel in enumerate(understood.channels)),
+        f"{len(frequency)} bins (window {spectrogram.window}, hop {spectrogram.hop}, fft "
+        f"{spectrogram.fft})",
+        _cost_line(plan),
+        *(_channel_line(number, channel) for number, channel in enumerate(plan.channels)),
     ]
-    of_impulse = replace(understood.head, call=CallSettings())
-    here, there = (1e3 * head.resolution for head in (understood.head, of_impulse))
-    if here > COARSER * there:
+    of_impulse = replace(plan.head, call=CallSettings())
+    here, there = (1e3 * head.resolution for head in (plan.head, of_impulse))
+    if here > MIN_COMPRESSION_GAIN * there:
         lines.append(
             f"note:       ranges are resolved to {here:.0f} mm; import.compress=true resolves "
             f"them to {there:.0f} mm"
         )
-    applied = {k: v for k, v in understood.calibration.items() if v not in (0.0, 1.0)}
+    applied = {k: v for k, v in plan.calibration.items() if v not in (0.0, 1.0)}
     if applied:
         lines.append(f"calibration: {json.dumps(applied)}")
-    faults = [f"warning:    {fault}" for fault in faults_of_channels(understood.channels)]
-    return [*lines, *(f"note:       {note}" for note in understood.notes), *faults]
+    faults = [f"warning:    {fault}" for fault in faults_of_channels(plan.channels)]
+    return [*lines, *(f"note:       {note}" for note in plan.notes), *faults]
 
 
-def _cost_line(understood: Understood) -> str:
+def _cost_line(plan: ImportPlan) -> str:
     """Show the size of the store and the duration of the import, measured on one ping."""
     begun = time.monotonic()
-    heard = spectrogram_of(understood, int(understood.pings[0]))
-    seconds = len(understood.pings) * (time.monotonic() - begun + WRITTEN_SECONDS)
+    heard = spectrogram_of(plan, int(plan.pings[0]))
+    seconds = len(plan.pings) * (time.monotonic() - begun + WRITTEN_SECONDS)
     return (
-        f"store:      {1e-6 * len(understood.pings) * heard.nbytes:,.0f} MB at most, in about "
+        f"store:      {1e-6 * len(plan.pings) * heard.nbytes:,.0f} MB at most, in about "
         f"{duration(seconds)}"
     )
 
@@ -270,7 +271,7 @@ def _channel_line(number: int, channel: Channel) -> str:
         noise = f"noise {-channel.noise_db:.0f} dB below it"
     return (
         f"channel {number}:  loudest echo {channel.level_db + 0.0:.1f} dB, {noise}; echoes in "
-        f"{channel.heard} of {channel.asked} pings"
+        f"{channel.heard} of {channel.checked} pings"
     )
 
 
@@ -278,18 +279,18 @@ def _kinds(units: dict[str, str]) -> dict[str, str]:
     return {("angles" if unit in ("deg", "rad") else "lengths"): unit for unit in units.values()}
 
 
-def draw(understood: Understood, folder: Path) -> Path:
+def draw_plan(plan: ImportPlan, folder: Path) -> Path:
     """Draw poses, and waveforms and spectrograms of the first pings, into a folder."""
-    head = understood.head
-    pings = [int(ping) for ping in understood.pings[:SHOWN]]
+    head = plan.head
+    pings = [int(ping) for ping in plan.pings[:SHOWN_PINGS]]
     picture = pings_png(
-        [understood.cutter.echo(ping, head.samples) for ping in pings],
-        [spectrogram_of(understood, ping) for ping in pings],
-        [understood.recording.labels[ping] for ping in pings],
-        sampling_rate=understood.settings.spectrogram.sampling_rate,
+        [plan.cutter.echo(ping, head.samples) for ping in pings],
+        [spectrogram_of(plan, ping) for ping in pings],
+        [plan.recording.labels[ping] for ping in pings],
+        sampling_rate=plan.settings.spectrogram.sampling_rate,
         range_m=head.range,
         frequency_hz=head.frequency,
-        poses=understood.poses[understood.pings],
+        poses=plan.poses[plan.pings],
     )
     storage.commit_bytes(folder / "pings.png", picture)
     return folder / "pings.png"

@@ -73,7 +73,7 @@ def read_poses(run: Run, path: Path, frame: FrameName = "auto") -> Poses:
     return to_poses(read_table(path, settings), settings)
 
 
-DRAWN = 3
+DRAWN_POSES = 3
 """Poses that are drawn where no number is given: the best, the median and the worst."""
 
 
@@ -84,7 +84,7 @@ def predict(
     poses_csv: Path | None = None,
     frame: FrameName = "auto",
     output: Path | None = None,
-    pictures: int | Literal["all"] = DRAWN,
+    pictures: int | Literal["all"] = DRAWN_POSES,
     accelerator: str = "auto",
     progress: Progress | None = None,
 ) -> Path:

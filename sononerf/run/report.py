@@ -413,10 +413,10 @@ def _isosurface(page: Page, run: Run, progress: Progress) -> None:
 def _comparisons(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
     for file in sorted(path.glob("*/comparison.json")):
         with damage_named(file):
-            told: dict[str, Any] = storage.read_json(file)
-            away, score = told.get("distance_m"), told.get("score")
+            comparison: dict[str, Any] = storage.read_json(file)
+            away, score = comparison.get("distance_m"), comparison.get("score")
             said = (
-                f"Beside `{told.get('second')}` the strongest difference is "
+                f"Beside `{comparison.get('second')}` the strongest difference is "
                 + (NONE if score is None else f"{score:.2f}")
                 + " of the common maximum"
                 + (

@@ -30,7 +30,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.display import Shown
+from sononerf.display import NotebookRepr
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError
@@ -52,13 +52,13 @@ from sononerf.simulation.simulator import ensemble_poses
 from sononerf.start.surface import Surface, confidence_of, error_of
 
 METRICS_SCHEMA = 1
-Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
-STAGES: tuple[Stage, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
+StageName = Literal["fit", "surface", "traced", "prediction", "evaluation"]
+STAGES: tuple[StageName, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
 """Stages of a run, in order: the fit; the reconstruction; gain and weight of echoes traced off it;
 the prediction of held-out poses; the comparison with the true surface and the baselines."""
 
 
-class Run(Shown):
+class Run(NotebookRepr):
     """A run on disk; each of its parts is loaded at first use.
 
     Args:
@@ -313,7 +313,7 @@ class Run(Shown):
 
     # Which stages are done.
 
-    def is_done(self, stage: Stage) -> bool:
+    def is_done(self, stage: StageName) -> bool:
         """Return whether a stage came to its end, with the results of the stages before it."""
         if stage == "fit":
             return (self.path / DESCRIPTION_NAME).is_file()

@@ -27,12 +27,12 @@ from sononerf.settings import loading
 from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import pose_seed
 
-Kind = Literal["scene", "field", "renderer"]
+PluginKind = Literal["scene", "field", "renderer"]
 TEMPLATES = Path(__file__).resolve().parent.parent / "templates"
 """Folder of the packages, one per kind; each is called ``my-KIND``, its module ``my_KIND``."""
 
 
-def new_plugin(kind: Kind, name: str, folder: Path | None = None) -> list[Path]:
+def new_plugin(kind: PluginKind, name: str, folder: Path | None = None) -> list[Path]:
     """Write a plugin with one scene, field or renderer: two files that install, and their test."""
     module = name.replace("-", "_")
     if not re.fullmatch(r"[A-Za-z]([A-Za-z0-9_-]*[A-Za-z0-9])?", name):

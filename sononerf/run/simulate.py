@@ -12,7 +12,7 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.progress import Progress
 from sononerf.recordings.recording import pose_table, wav_bytes
 from sononerf.run.build import head_of, simulator_of
-from sononerf.run.understand import OWN_SETTINGS
+from sononerf.run.import_plan import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import to_yaml
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
@@ -167,7 +167,7 @@ def write_waveforms(
     """Simulate the sound at the receivers at every pose, and write WAV files with a table.
 
     The folder is what ``sononerf import recordings`` reads: a WAV file per pose (32-bit floats),
-    ``poses.csv``, and ``import.yaml`` with air, ears, call and analysis. Poses, echoes and noise
+    ``poses.csv``, and ``import.yaml`` with air, ears, call and spectrogram. Poses, echoes and noise
     are those of :func:`sononerf.run.simulate.simulate`.
     """
     progress = progress or Progress(quiet=True)
@@ -193,9 +193,10 @@ def write_waveforms(
             storage.commit_bytes(folder / name, wav_bytes(waveform, rate))
             task.advance()
     plain = settings.plain()
-    told = {name: plain[name] for name in HEAD_SECTIONS}
-    told["import"] = {"source": f"simulated, scene {settings.scene.name}" if settings.scene else ""}
-    storage.commit_text(folder / OWN_SETTINGS, to_yaml(told))
+    sections = {name: plain[name] for name in HEAD_SECTIONS}
+    source = f"simulated, scene {settings.scene.name}" if settings.scene else ""
+    sections["import"] = {"source": source}
+    storage.commit_text(folder / OWN_SETTINGS, to_yaml(sections))
     # The table comes last: without it the folder cannot be imported.
     storage.commit_text(folder / "poses.csv", pose_table(poses, names, split))
     return [folder / "poses.csv", folder / OWN_SETTINGS, folder / names[0]]

@@ -19,7 +19,7 @@ from sononerf.run.run import Run, open_run
 from sononerf.run.simulate import store_path
 from sononerf.start.surface import confidence_of, error_of
 
-WAIT = 2.0
+REFRESH_SECONDS = 2.0
 """Interval at which a run's folder is checked for new files, s."""
 
 
@@ -91,8 +91,8 @@ class View:
         self.viewer.show_surface(views)
         if (self.run.reconstruction / "volume.vti").is_file():
             self.viewer.show_volume(read_volume(self.run.path))
-        told = self.run.read_out
-        self._say(f"surface found as {told.get('method')}, refined: {told.get('refined')}")
+        read_out = self.run.read_out
+        self._say(f"surface found as {read_out.get('method')}, refined: {read_out.get('refined')}")
 
     def _say(self, text: str) -> None:
         self.viewer.say(f"**{self.run.path.resolve().name}**: {text}.")
@@ -109,7 +109,7 @@ class View:
     def follow(self) -> None:
         """Refresh again and again, until the process is stopped."""
         while True:
-            time.sleep(WAIT)
+            time.sleep(REFRESH_SECONDS)
             try:
                 self.refresh()
             except SonoNerfError as error:

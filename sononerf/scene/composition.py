@@ -174,8 +174,8 @@ def _within(mesh: trimesh.Trimesh, low: Floats, high: Floats) -> trimesh.Trimesh
     """Return the triangles whose bounding boxes reach into a box."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     corners = vertices[faces]
-    reach = (corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)
-    return trimesh.Trimesh(vertices, faces[reach.all(axis=1)], process=False, validate=False)
+    overlaps = (corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)
+    return trimesh.Trimesh(vertices, faces[overlaps.all(axis=1)], process=False, validate=False)
 
 
 def _pierces(edged: trimesh.Trimesh, faced: trimesh.Trimesh) -> bool:

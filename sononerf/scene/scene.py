@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from sononerf.display import Shown
+from sononerf.display import NotebookRepr
 from sononerf.errors import InputError, NumericalError, SettingsError, expect
 from sononerf.geometry.meshes import Plane, surface_faults
 from sononerf.geometry.poses import Poses, aim_fault
@@ -53,7 +53,7 @@ class SurfaceSizeError(InputError):
 
 
 @dataclass(frozen=True, eq=False)
-class Scene(Shown):
+class Scene(NotebookRepr):
     """A surface and its material.
 
     Args:
@@ -253,7 +253,7 @@ def _built(owner: str, factory: Callable[..., Any], arguments: dict[str, Any]) -
     return scene
 
 
-def check_poses(
+def check_positions(
     scene: Scene, poses: Poses, *, offsets: Floats | None = None, plane: Plane | None = None
 ) -> None:
     """Refuse poses that lie inside the surface, or not above the support.

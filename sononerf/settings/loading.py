@@ -36,7 +36,7 @@ from sononerf.storage import require_regular
 SCENES = "sononerf.scenes"
 FIELDS = "sononerf.fields"
 RENDERERS = "sononerf.renderers"
-GONE = {("field", "hash"): "take grid, or the plugin in docs/extending.md, A hash grid"}
+REMOVED = {("field", "hash"): "take grid, or the plugin in docs/extending.md, A hash grid"}
 """What to use instead of built-in plugins that were removed."""
 
 
@@ -69,8 +69,10 @@ def load(group: str, name: str) -> Callable[..., Any]:
     plugins = registered(group)
     claims = [plugin for plugin in plugins if plugin.name == name]
     if not claims:
-        if (kind, name) in GONE:
-            raise SettingsError(f"{kind} {name!r} was removed in version 0.2.0; {GONE[kind, name]}")
+        if (kind, name) in REMOVED:
+            raise SettingsError(
+                f"{kind} {name!r} was removed in version 0.2.0; {REMOVED[kind, name]}"
+            )
         names = sorted({plugin.name for plugin in plugins})
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]}? " if near else ""
@@ -114,7 +116,7 @@ def check_options(
         checked = model.model_validate(dict(options))
     except ValidationError as error:
         raise SettingsError(describe_faults(error, model, None, where)) from None
-    refuse_truths(options, checked, prefix=where)
+    reject_booleans(options, checked, prefix=where)
     return {name: getattr(checked, name) for name in model.model_fields}
 
 
@@ -280,7 +282,7 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
         settings = Settings.model_validate(dict(data))
     except ValidationError as error:
         raise SettingsError(describe_faults(error, Settings, source)) from None
-    refuse_truths(data, settings, source=source)
+    reject_booleans(data, settings, source=source)
     settings.__dict__["source"] = source
     return settings
 
@@ -297,7 +299,7 @@ def checked_section(
         section = model.model_validate(dict(given))
     except ValidationError as error:
         raise SettingsError(describe_faults(error, model, None, where)) from None
-    refuse_truths(given, section, prefix=where)
+    reject_booleans(given, section, prefix=where)
     return section
 
 
@@ -418,7 +420,7 @@ def describe_faults(
     return "\n".join(lines)
 
 
-def refuse_truths(
+def reject_booleans(
     given: Mapping[str, Any], taken: BaseModel, *, source: str | None = None, prefix: str = ""
 ) -> None:
     """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0."""

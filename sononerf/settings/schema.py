@@ -212,9 +212,9 @@ class SpectrogramSettings(Section):
         return self
 
 
-def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
+def check_call(call: CallSettings, spectrogram: SpectrogramSettings) -> None:
     """Refuse a sweep that the sampling rate cannot hold, or of which nothing is analysed."""
-    bands, half = call.bands, analysis.sampling_rate / 2
+    bands, half = call.bands, spectrogram.sampling_rate / 2
     for number, (_, high) in bands.items():
         if high > half:
             raise ValueError(
@@ -222,7 +222,7 @@ def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
                 f"spectrogram.sampling_rate ({half:g} Hz); lower the call's frequencies, leave "
                 "the harmonic out (amplitude 0) or raise the rate"
             )
-    low, high = analysis.frequency_min, analysis.frequency_max
+    low, high = spectrogram.frequency_min, spectrogram.frequency_max
     if bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
         swept = ", ".join(f"{lo:g} to {hi:g} Hz" for lo, hi in bands.values())
         raise ValueError(

@@ -96,25 +96,25 @@ CALL_PRESETS = {
 """By the name that ``call.preset`` takes."""
 
 
-def window_of(analysis: dict[str, Any]) -> int:
+def window_of(spectrogram: dict[str, Any]) -> int:
     """Return the power of two, in samples, that is nearest to 6.4 periods of the highest frequency.
 
     It gives 64 at 1 MHz for up to 100 kHz.
     """
-    if not {"sampling_rate", "frequency_max"} <= analysis.keys():  # another check reports it
+    if not {"sampling_rate", "frequency_max"} <= spectrogram.keys():  # another check reports it
         return 64
-    periods = 6.4 * analysis["sampling_rate"] / analysis["frequency_max"]
+    periods = 6.4 * spectrogram["sampling_rate"] / spectrogram["frequency_max"]
     return int(2 ** max(round(math.log2(periods)), 3))
 
 
-def hop_of(analysis: dict[str, Any]) -> int:
+def hop_of(spectrogram: dict[str, Any]) -> int:
     """Return a sixteenth of the window that suits the band, in samples."""
-    return max(window_of(analysis) // 16, 1)
+    return max(window_of(spectrogram) // 16, 1)
 
 
-def fft_of(analysis: dict[str, Any]) -> int:
+def fft_of(spectrogram: dict[str, Any]) -> int:
     """Return eight times the window that suits the band, and more if a longer one is set."""
-    longest = max(8 * window_of(analysis), analysis.get("window", 8))
+    longest = max(8 * window_of(spectrogram), spectrogram.get("window", 8))
     return int(2 ** math.ceil(math.log2(longest)))
 
 

@@ -117,12 +117,12 @@ def _outline(
             a[k], b[k] = edges[e, 0, k], edges[e, 1, k]
             inward[k] = middles[facing, k] - a[k]
             along[k] = b[k] - a[k]
-        turned = (along[1] * inward[2] - along[2] * inward[1]) * (place[0] - a[0])
-        turned += (along[2] * inward[0] - along[0] * inward[2]) * (place[1] - a[1])
-        turned += (along[0] * inward[1] - along[1] * inward[0]) * (place[2] - a[2])
+        side = (along[1] * inward[2] - along[2] * inward[1]) * (place[0] - a[0])
+        side += (along[2] * inward[0] - along[0] * inward[2]) * (place[1] - a[1])
+        side += (along[0] * inward[1] - along[1] * inward[0]) * (place[2] - a[2])
         square, product, length, far = 0.0, 0.0, 0.0, 0.0
         for k in range(3):
-            ends[i, 0, k], ends[i, 1, k] = (b[k], a[k]) if turned < 0.0 else (a[k], b[k])
+            ends[i, 0, k], ends[i, 1, k] = (b[k], a[k]) if side < 0.0 else (a[k], b[k])
             square += along[k] * along[k]
             product += along[k] * inward[k]
         for k in range(3):
@@ -261,7 +261,7 @@ def wedge_directivity(
     bent = (distances[0] * distances[1] + heights[0] * heights[1]) / (radii[0] * radii[1])
     hyperbolic = xp.cosh(nu * xp.arccosh(xp.clip(bent, 1.0 + _LEAST, None)))
     total = 0.0
-    way = distances[0] + distances[1]
+    path = distances[0] + distances[1]
     square = xp.square(radii[0]) + xp.square(radii[1]) + xp.square(heights[0] - heights[1])
     for one in (-1.0, 1.0):
         for two in (-1.0, 1.0):
@@ -273,7 +273,7 @@ def wedge_directivity(
                     angles[0] + angles[1] if one < 0.0 else 2.0 * open_angle - angles[0] - angles[1]
                 )
                 mirrored = square - 2.0 * radii[0] * radii[1] * xp.cos(both)
-                detour = xp.clip(way - xp.sqrt(xp.clip(mirrored, _LEAST**2, None)), 0.0, None)
+                detour = xp.clip(path - xp.sqrt(xp.clip(mirrored, _LEAST**2, None)), 0.0, None)
                 term = -term * xp.expm1(-detour[:, None] * fade)
             total = total + term
     return -0.5 * nu[:, None] * total
@@ -307,9 +307,9 @@ class Diffraction:
         for index, reflection in enumerate(reflections):
             of_part = part == index
             share[of_part] = reflection.curved_share(caster.curvature[of_part])
-        turned = share * caster.curvature * np.asarray(scene.mesh.area_faces, dtype=np.float64)
+        curved = share * caster.curvature * np.asarray(scene.mesh.area_faces, dtype=np.float64)
         turn = self._edges.open_angle - math.pi
-        measure = np.concatenate([turn * self._edges.length, turned])
+        measure = np.concatenate([turn * self._edges.length, curved])
         silent = np.array([not strength.any() for strength in self._strength])
         measure[silent[self._part]] = 0.0
         self._end = np.cumsum(measure)

@@ -26,12 +26,12 @@ from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_call
 from sononerf.numerics import Floats, Singles
 from sononerf.progress import Progress
-from sononerf.resources import reach, require_disk
-from sononerf.scene.scene import Scene, check_aim, check_poses, check_reach, deaf
+from sononerf.resources import check_scheduler, require_disk
+from sononerf.scene.scene import Scene, check_aim, check_positions, check_reach, deaf
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.simulator import (
-    MOST,
+    MAX_RAYS,
     VERSION,
     SeedOf,
     Simulator,
@@ -102,18 +102,18 @@ def simulate(
     if path is not None and (finished := _finished(path, echoes_id)) is not None:
         return Echoes(finished, head)
     if scheduler is not None:
-        reach(scheduler)
-    warn_of_call(head.call, head.analysis)
+        check_scheduler(scheduler)
+    warn_of_call(head.call, head.spectrogram)
     simulator = Simulator(scene, head, settings)
     offsets = np.vstack((head.emitter, head.receivers))
-    check_poses(scene, poses, offsets=offsets, plane=head.plane)
+    check_positions(scene, poses, offsets=offsets, plane=head.plane)
     check_aim(scene, poses, is_directional=head.ears.is_directional)
     check_reach(
         scene,
         poses,
         bounces=settings.bounces,
-        range_min=head.analysis.range_min,
-        range_max=head.analysis.range_max,
+        range_min=head.spectrogram.range_min,
+        range_max=head.spectrogram.range_max,
     )
     if path is not None:
         storage.remove_if_empty(storage.probe_writable(path))
@@ -140,7 +140,7 @@ def simulate(
         return Echoes(kept, head)
     with storage.lock(path):
         store = EnsembleStore.create(
-            path, poses_positions=poses.positions, poses_rotations=poses.rotations, **given
+            path, positions=poses.positions, rotations=poses.rotations, **given
         )
         store.remove_damaged()
         attach(head, path)
@@ -190,10 +190,10 @@ def echo_hash(
 def _heard_settings(head: Head, options: SimulationSettings) -> dict[str, Any]:
     """Return the settings that the echoes depend on, without optional keys that do not apply."""
     plain = {**_plain(head, options), "call": call_content(head.call)}
-    ears, air, analysis = plain["ears"], plain["air"], plain["spectrogram"]
-    if analysis["kind"] == "stft":
+    ears, air, spectrogram = plain["ears"], plain["air"], plain["spectrogram"]
+    if spectrogram["kind"] == "stft":
         for key in ("kind", "channels", "q"):
-            del analysis[key]
+            del spectrogram[key]
     if plain["simulation"]["rays"] is not None:
         del plain["simulation"]["accuracy_db"]
     if ears["directivity"] != "piston":
@@ -259,7 +259,7 @@ def _fill(
     wanted = [*missing, *test]
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
     known = store.attributes.get("rays")
-    if options.rays is None and isinstance(known, int) and 0 < known <= MOST:
+    if options.rays is None and isinstance(known, int) and 0 < known <= MAX_RAYS:
         # An interrupted simulation continues with its initial number of rays.
         options = options.model_copy(update={"rays": known})
     here = 1 if scheduler is not None else workers
@@ -289,8 +289,8 @@ def _fill(
             workers=workers,
             scheduler=scheduler,
         )
-    analysis = simulator.head.analysis
-    silent = deaf(analysis.range_min, analysis.range_max)
+    limits = simulator.head.spectrogram
+    silent = deaf(limits.range_min, limits.range_max)
     seal(store, {int(i): again[int(i)] for i in test}, silent=silent)
 
 

@@ -108,8 +108,8 @@ def _slopes(
         return slope
     along = points @ axes.T - np.einsum("md,md->m", places, axes)
     both = along.astype(np.float32) * across
-    turned = (normals @ axes.T).astype(np.float32) - both * (3.0 / square).astype(np.float32)
-    dipole = grown * turned
+    gradient = (normals @ axes.T).astype(np.float32) - both * (3.0 / square).astype(np.float32)
+    dipole = grown * gradient
     dipole += both * np.complex64(wavenumber**2)
     dipole *= np.complex64(-1j * DIPOLE / wavenumber.real)
     dipole -= across * grown

@@ -67,7 +67,7 @@ class Footprint:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class MirrorPaths:
     r"""Ways from hits to a listener, compared with those by a mirror point nearby.
 
     To second order, the path's length over u and v has the slope :math:`g` and the Hessian
@@ -86,7 +86,7 @@ class Ways:
 
 
 @compiled
-def ways_to(
+def paths_to(
     rows: Singles,
     points: Floats,
     flat: Floats,
@@ -145,7 +145,7 @@ def ways_to(
 
 
 @compiled
-def emit(directions: Floats, length: Floats) -> Singles:
+def emit_bundles(directions: Floats, length: Floats) -> Singles:
     """Return bundles (N, 12) that an emitter sends over a way, see :func:`land`.
 
     They are turned at the emitter, not moved there, about two unit vectors that are square to each
@@ -171,7 +171,7 @@ def emit(directions: Floats, length: Floats) -> Singles:
 
 
 @compiled
-def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Singles:
+def onto(rows: Singles, bends: Singles, further: Ints, distance: Floats) -> Singles:
     """Return mirrored bundles (N, 12) where they are hit next, see :func:`land`.
 
     In: further (N,), distance ((N,), m).
@@ -181,8 +181,8 @@ def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Sin
         before = further[i]
         for k in range(6):
             # Its component along the ray is lost where the bundle lands.
-            bundles[i, k] = rows[before, k] + distance[i] * turned[before, k]
-            bundles[i, 6 + k] = turned[before, k]
+            bundles[i, k] = rows[before, k] + distance[i] * bends[before, k]
+            bundles[i, 6 + k] = bends[before, k]
     return bundles
 
 
@@ -193,10 +193,10 @@ def land(
     """Return footprints of bundles on the surface, and the mirrored bundles.
 
     In: bundles ((H, 12) float32), incoming (H, 3), normals, flat (H, 3), gradients ((H, 4, 3)
-    float32). Out: rows ((H, 19) float32), turned ((H, 6) float32), flat (H, 3), mirrored (H, 3).
+    float32). Out: rows ((H, 19) float32), bends ((H, 6) float32), flat (H, 3), mirrored (H, 3).
     """
     count = len(bundles)
-    rows, turned = np.zeros((count, 19), np.float32), np.zeros((count, 6), np.float32)
+    rows, bends = np.zeros((count, 19), np.float32), np.zeros((count, 6), np.float32)
     outward, mirrored = np.zeros((count, 3)), np.zeros((count, 3))
     tilts = np.zeros(6)
     for i in range(count):
@@ -232,9 +232,9 @@ def land(
             out = wx * nx + wy * ny + wz * nz
             wx, wy, wz = wx - out * nx, wy - out * ny, wz - out * nz
             change = tx * nx + ty * ny + tz * nz + wx * x + wy * y + wz * z
-            turned[i, 3 * k] = tx - 2.0 * (change * nx + along * wx)
-            turned[i, 3 * k + 1] = ty - 2.0 * (change * ny + along * wy)
-            turned[i, 3 * k + 2] = tz - 2.0 * (change * nz + along * wz)
+            bends[i, 3 * k] = tx - 2.0 * (change * nx + along * wx)
+            bends[i, 3 * k + 1] = ty - 2.0 * (change * ny + along * wy)
+            bends[i, 3 * k + 2] = tz - 2.0 * (change * nz + along * wz)
             row[3 * k], row[3 * k + 1], row[3 * k + 2] = sx, sy, sz
             tilts[3 * k], tilts[3 * k + 1], tilts[3 * k + 2] = wx, wy, wz
             off = sx * nx + sy * ny + sz * nz
@@ -249,4 +249,4 @@ def land(
         row[13] = row[3] * tilts[3] + row[4] * tilts[4] + row[5] * tilts[5]
         row[14] = row[0] * tilts[3] + row[1] * tilts[4] + row[2] * tilts[5]
         row[17], row[18] = sink, abs(cross)
-    return rows, turned, outward, mirrored
+    return rows, bends, outward, mirrored

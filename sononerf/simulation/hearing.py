@@ -33,11 +33,11 @@ RESOLVED_FREQUENCY = 80e3
 default band, 100 kHz."""
 RESOLVED = 1.0
 """Bend of the path over a bundle up to which a mirror point in it is resolved, rad."""
-NEAR = 4.0
+MAX_PHASE = 4.0
 """Phase from a bundle to a mirror point up to which the point counts, rad; it has e^-4 there."""
-REACHED = 1.0
+MAX_BUNDLE_SIDES = 1.0
 """Distance from the middle of a bundle to a mirror point of its own, sides of the bundle."""
-WIDE = 5e-4
+MAX_BUNDLE_WIDTH = 5e-4
 """Width of a bundle, m, above which it may hold a mirror point of the next bounce that its ray does
 not show."""
 EXPLORE = 0.1
@@ -64,10 +64,10 @@ class Audibility:
         angle = np.atleast_1d(np.asarray(bounce.solid_angle, dtype=np.float64))
         tube = np.ascontiguousarray(bounce.footprint.tube)
         for place in listeners:
-            ways = bounce.ways_to(place)
+            paths = bounce.paths_to(place)
             _judge(
-                audible, doubt, ways.distance, ways.rise, ways.detour, ways.stiffness, tube, angle,
-                self.wavenumber, self.farthest, explore,
+                audible, doubt, paths.distance, paths.rise, paths.detour, paths.stiffness, tube,
+                angle, self.wavenumber, self.farthest, explore,
             )  # fmt: skip
         return audible, doubt
 
@@ -100,20 +100,20 @@ def _judge(
         if facing and detour[i] < 1.25 * farthest:
             audible[i] = True
         # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
-        off = math.sqrt(2.0 * detour[i] / max(stiffness[i], 1e-12)) - REACHED * side
+        off = math.sqrt(2.0 * detour[i] / max(stiffness[i], 1e-12)) - MAX_BUNDLE_SIDES * side
         least = 0.5 * stiffness[i] * max(off, 0.0) ** 2
         turns = k * stiffness[i] * angle
-        if facing and turns > RESOLVED and k * least < NEAR:
+        if facing and turns > RESOLVED and k * least < MAX_PHASE:
             found = level / distance[i] * math.exp(-k * least) * min(turns, 10.0)
             doubt[i] = max(doubt[i], found)
-        if side * width > WIDE:
+        if side * width > MAX_BUNDLE_WIDTH:
             doubt[i] = max(doubt[i], explore * level)
 
 
-FINE = 0.05
+POINT_SPACING = 0.05
 """Distance between points at which the first arrival is sought, in radii of a sphere around the
 scene. The path is then at most 0.1 % of that radius too long."""
-SILENT = 0.21 / NODE_SPACING
+SILENT_TIME = 0.21 / NODE_SPACING
 """Time before the first arrival up to which the echo is zero, s (26 us). With half an analysis
 window of 32 us nothing is heard more than 10 mm before the nearest point."""
 
@@ -131,7 +131,7 @@ class Arrival:
         self._middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
         self.radius = float(np.linalg.norm(corners - self._middle, axis=1).max())
         vertices, faces = trimesh.remesh.subdivide_to_size(
-            scene.mesh.vertices, scene.mesh.faces, FINE * self.radius, max_iter=20
+            scene.mesh.vertices, scene.mesh.faces, POINT_SPACING * self.radius, max_iter=20
         )
         used = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
         self._points: Floats = np.unique(used, axis=0) - self._middle
@@ -146,10 +146,10 @@ class Arrival:
         for pose, heads in enumerate(np.concatenate([emitters[:, None], ears], axis=1)):
             heads = heads - self._middle
             # Products suffice: coordinates count from the middle of the scene.
-            way = square - 2.0 * heads @ self._points.T
-            way += np.einsum("hd,hd->h", heads, heads)[:, None]
-            np.sqrt(np.maximum(way, 0.0, out=way), out=way)
-            lengths[pose] = (way[:1] + way[1:]).min(axis=1)
+            lengths_via = square - 2.0 * heads @ self._points.T
+            lengths_via += np.einsum("hd,hd->h", heads, heads)[:, None]
+            np.sqrt(np.maximum(lengths_via, 0.0, out=lengths_via), out=lengths_via)
+            lengths[pose] = (lengths_via[:1] + lengths_via[1:]).min(axis=1)
         return lengths
 
 
@@ -163,7 +163,7 @@ def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floa
     In: echo (E, S), first ((E,), s), sampling_rate (Hz). Out: echo (E, S).
     """
     before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
-    return np.where(before < SILENT, echo, 0.0)
+    return np.where(before < SILENT_TIME, echo, 0.0)
 
 
 class Listener(Protocol):
@@ -239,7 +239,7 @@ class Hearing:
     def beam(self, emitted: Floats, rotation: Floats) -> Singles:
         """Return the beam's gain (N, F) towards directions (N, 3) of the world."""
         if self.image is not None:
-            emitted = emitted @ self.image.turn
+            emitted = emitted @ self.image.reflection
         return beam_gain(self.ears, _into_head(emitted, rotation))
 
     def gain(self, ear: int, towards: Floats, rotation: Floats) -> Singles:
@@ -277,9 +277,9 @@ class Hearing:
         gain /= (self.speed_of_sound * distance).astype(np.float32)[:, None]
         delay, spread = (length + distance) / self.speed_of_sound, spread / self.speed_of_sound
         if shaded is not None:
-            turned, dim, passed = shaded
+            quadrature, dim, passed = shaded
             part = gain.take(dim, axis=0)
-            turned.add(ear, delay.take(dim), spread.take(dim), part * passed.imag)
+            quadrature.add(ear, delay.take(dim), spread.take(dim), part * passed.imag)
             gain[dim] = part * passed.real
         sound.add(ear, delay, spread, gain)
 
@@ -297,7 +297,7 @@ class Hearing:
 @lru_cache(maxsize=2)  # tables of many receivers are large
 def hearing_of(head: Head) -> Hearing:
     """Return the response of a head, with its time bins; computed once per head."""
-    return Hearing(head, plan_synthesis(head.analysis, head.samples))
+    return Hearing(head, plan_synthesis(head.spectrogram, head.samples))
 
 
 def _into_head(vectors: Floats, rotation: Floats) -> Floats:

@@ -43,9 +43,11 @@ IMAGES = 2
 """Periods of the nodes on each side that count; the kernel falls as the third power."""
 OVERSAMPLING = 4
 LEVELS = 10  # of bins, each twice as wide as the one before; the last smooths away even 10 kHz
-GUARD = 512  # samples behind the last frame, for the filters' response before and after an echo
+FILTER_GUARD = (
+    512  # samples behind the last frame, for the filters' response before and after an echo
+)
 RING = 384  # samples; farther from an echo the filters' response is some 100 dB down
-SHORTEST = 4  # the part of a record that is filtered is no less than one over this
+MIN_RECORD_PARTS = 4  # the part of a record that is filtered is no less than one over this
 # Laying an echo between two bins of width 1 and reading them as triangles spreads it by 1/6 twice.
 LEVEL_VARIANCE = 1.0 / 3.0
 
@@ -104,7 +106,9 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     nodes: Floats = (np.arange(count, dtype=np.float64) + 0.5) * (top / count)
     # The coarsest level must hold a whole number of bins.
     unit = 2 ** (LEVELS - 1)
-    length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))
+    length = unit * int(
+        scipy.fft.next_fast_len(math.ceil((samples + FILTER_GUARD) / unit), real=True)
+    )
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
     even, odd = between(np.minimum(frequency, top), nodes)
     end = min(top * 4.0 / 3.0, rate / 2.0)
@@ -168,7 +172,7 @@ def deposit(
         np.array(spread, dtype=np.float64),
         np.array(strength, dtype=kind, order="C"),
         synthesis.sampling_rate * OVERSAMPLING,
-        float(OVERSAMPLING * (synthesis.samples + GUARD // 2)),
+        float(OVERSAMPLING * (synthesis.samples + FILTER_GUARD // 2)),
     )
     bins.first = min(bins.first, earliest / OVERSAMPLING)
     bins.last = max(bins.last, latest / OVERSAMPLING)
@@ -285,7 +289,7 @@ def _stretch(synthesis: Synthesis, bins: Bins) -> tuple[int, int]:
     """
     unit = 2 ** (LEVELS - 1) // OVERSAMPLING
     earliest = unit * math.floor((bins.first - RING) / unit)
-    part = SHORTEST
+    part = MIN_RECORD_PARTS
     while part > 1:
         length = synthesis.length // part
         begin = min(earliest, synthesis.length - length)

@@ -39,31 +39,31 @@ from sononerf.simulation.equivalent_sources import (
 )
 from sononerf.simulation.hearing import Arrival, Hearing
 
-FALL = 1.3
+CROSSOVER = 1.3
 """Highest frequency of the low band over the one from which it gives way to the rays. A wider
 crossing keeps more of the error of the rays, a narrower one rings longer."""
-WORTH = 1.5
+MIN_BAND_RATIO = 1.5
 """Least highest frequency of the low band over the lowest analysed one; below, little is gained."""
 LARGEST_ERROR = 0.1
 """Error of the velocity on the surface above which the rays do all; 10 % is about 1 dB."""
 PER_WAVELENGTH = 3.0
 """Sources along one wavelength at the highest frequency. With 3 the velocity errs by 3 %."""
-FEWEST = 0.5
+FEWEST_SOURCES = 0.5
 """Sources at low frequencies over those at the highest. The error is then below 0.5 %."""
 LEVELS = 4
 """Different numbers of sources between these two. The error jumps where the number changes."""
 SHALLOWEST = 0.8
 """Least depth, in distances between sources. Above it the pattern of single sources is heard."""
-THIN = 0.05
+MAX_THIN_FRACTION = 0.05
 """Greatest fraction of the surface where the body is too thin for the least depth."""
-CONTROL = 100
+CONTROL_POINTS = 100
 """Points of the surface at which the gains of beam and ears are looked up."""
 ORDER = 3
 """Degree of the polynomial over position that is fitted to these gains. 5 gave the same echoes."""
 BLOCK = 64
 """Poses that are solved for together. It is fixed, so that the rounding of a pose's result does not
 depend on the other poses."""
-FEW = 8
+FEW_POSES = 8
 """Poses that are solved for together where the equations are kept and poses come one by one. With
 64 a single pose takes 0.7 s, with 8 or 2 it takes 0.25 s."""
 LEAD = 2.5
@@ -73,7 +73,7 @@ TAIL = 1.0
 PATH = 5.0
 """Length of the path over which the response is kept after the first arrival, in radii of a sphere
 around the scene. Later sound wraps around; for ``three_spheres`` it is 60 dB down."""
-KEPT = 0.25
+MAX_MEMORY_FRACTION = 0.25
 """Fraction of the free memory that factorised equations may take where they are kept."""
 LARGEST_KA = 12.0
 """Wavenumber times radius above which rays are as good, see ``docs/simulator.md``."""
@@ -103,7 +103,7 @@ class HeadPoses:
             np.concatenate([self.emitters, plane.mirrored(self.emitters)]),
             np.concatenate([self.ears, self.ears]),
             np.concatenate([self.rotations, self.rotations]),
-            np.concatenate([self.emitting, plane.turn @ self.emitting]),
+            np.concatenate([self.emitting, plane.reflection @ self.emitting]),
             self.gains,
         )
 
@@ -159,7 +159,7 @@ class LowBand:
         frequency_max (Hz): Frequency at which it has fallen to zero.
         period: Samples of a response.
         keeps: True if the factorised equations are kept. Further poses are then solved for at once,
-            in blocks of ``FEW``.
+            in blocks of ``FEW_POSES``.
         error: Error of the normal velocity on the surface relative to the incident one, root mean
             square over all poses solved for, by frequency in Hz.
 
@@ -177,7 +177,7 @@ class LowBand:
         rate = hearing.synthesis.sampling_rate
         highest = resolved_frequency(scene, most, speed_of_sound=hearing.speed_of_sound)
         self.frequency_max = min(highest, rate / 2.0)
-        self.frequency_full = self.frequency_max / FALL
+        self.frequency_full = self.frequency_max / CROSSOVER
         width = self.frequency_max - self.frequency_full
         self._lead = LEAD / width
         duration = PATH * arrival.radius / hearing.speed_of_sound + self._lead + TAIL / width
@@ -214,7 +214,7 @@ class LowBand:
             power for power in itertools.product(range(ORDER + 1), repeat=3) if sum(power) <= ORDER
         ]
         terms = np.stack([np.prod(points**power, axis=1) for power in powers], axis=1)
-        return terms @ np.linalg.pinv(terms[:CONTROL], rcond=1e-6)
+        return terms @ np.linalg.pinv(terms[:CONTROL_POINTS], rcond=1e-6)
 
     @property
     def thin(self) -> float:
@@ -225,8 +225,10 @@ class LowBand:
     def sources(self, frequency: float) -> int:
         """Return how many sources are used at a frequency in Hz, on a few levels."""
         wanted = np.square(frequency / self.frequency_max)
-        level = math.ceil(max(wanted - FEWEST, 0.0) / (1.0 - FEWEST) * LEVELS) / LEVELS
-        return round((FEWEST + (1.0 - FEWEST) * min(level, 1.0)) * self.most)
+        level = (
+            math.ceil(max(wanted - FEWEST_SOURCES, 0.0) / (1.0 - FEWEST_SOURCES) * LEVELS) / LEVELS
+        )
+        return round((FEWEST_SOURCES + (1.0 - FEWEST_SOURCES) * min(level, 1.0)) * self.most)
 
     def trial(self) -> float:
         """Return the error, see :attr:`error`, at the highest frequency, seen from three sides."""
@@ -312,12 +314,12 @@ class LowBand:
         """
         frequency = wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
         equations = self._equations_of(frequency, wavenumber)
-        ears, control = poses.ears.shape[1], self.surface[0][:CONTROL]
+        ears, control = poses.ears.shape[1], self.surface[0][:CONTROL_POINTS]
         points = self._blend[equations.chosen].T
         sources = self._blend[: len(equations.places)].T
         heard = np.zeros((len(poses), ears), dtype=np.complex128)
         squares = []
-        block = FEW if self.keeps else BLOCK
+        block = FEW_POSES if self.keeps else BLOCK
         for start in range(0, len(poses), block):
             some = poses[np.arange(start, start + block).clip(max=len(poses) - 1)]
             incident = arriving(equations.points, equations.normals, some.emitters, wavenumber)
@@ -341,7 +343,7 @@ class LowBand:
             return self._equations[frequency]
         equations = self._equations_at(frequency, wavenumber)
         free = available_memory() or 0
-        if self.keeps and equations.bytes * len(self.frequency) < KEPT * free:
+        if self.keeps and equations.bytes * len(self.frequency) < MAX_MEMORY_FRACTION * free:
             self._equations[frequency] = equations
         return equations
 
@@ -383,13 +385,13 @@ def low_band(
         return "the surface is open"
     most = min(sources, sources_worth(scene))
     highest = resolved_frequency(scene, most, speed_of_sound=hearing.speed_of_sound)
-    if highest < WORTH * frequency_min:
+    if highest < MIN_BAND_RATIO * frequency_min:
         return (
             f"the scene is so large that {most} sources reach {highest / 1e3:.2g} kHz; "
             "simulation.sources raises that"
         )
     band = LowBand(scene, hearing, arrival, most=most)
-    if band.thin > THIN:
+    if band.thin > MAX_THIN_FRACTION:
         return "the body is too thin for equivalent sources"
     error = band.trial()
     if error > LARGEST_ERROR:

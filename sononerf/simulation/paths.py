@@ -16,12 +16,12 @@ from sononerf.geometry.directions import CapSpiral, Cells
 from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.numerics import Bools, Complexes, Floats, Ints, Singles, compiled
 from sononerf.scene.material import Material
-from sononerf.simulation.footprint import Footprint, Ways, emit, land, onto, ways_to
+from sononerf.simulation.footprint import Footprint, MirrorPaths, emit_bundles, land, onto, paths_to
 
 COARSEST = 10.0  # rad
 LEAST_RISE = 1e-4  # sine of the angle below which sound grazes a surface
 # Beyond this many standard deviations a lobe is 3e-4 of its middle (-70 dB) and left out.
-REACH = 4.0
+BEAM_WIDTHS = 4.0
 # A smooth surface sends sound where its shape does: Kirchhoff's integral over it, which lives from
 # the first Fresnel zones about the mirror point. Places farther away fade by this much per radian
 # of phase; by itself it would cancel, up to false echoes from the border of light and shadow and
@@ -86,7 +86,7 @@ class Reflection:
         widest = float(self.lobe_width.max())
         if self.material.mixed:
             widest = max(widest, float(self.curved_lobe_width.max()))
-        return min(REACH * widest, float(np.pi))
+        return min(BEAM_WIDTHS * widest, float(np.pi))
 
 
 def reflection(material: Material, frequency: ArrayLike, *, speed_of_sound: float) -> Reflection:
@@ -178,7 +178,7 @@ def lobe_exponent(cosine: Floats, lobe_width: Floats) -> Floats:
 
 
 SPLIT = 2  # along each side of a divided cell
-GATHERED = 8192  # hits processed together: a call of numpy costs as much as hundreds
+BATCH_HITS = 8192  # hits processed together: a call of numpy costs as much as hundreds
 CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
 
 Beyond = Callable[[Hits, Floats], tuple[Hits, Floats]]
@@ -200,14 +200,14 @@ class Bounce:
     triangles: Ints  # (H, n): Indices of the triangles hit so far, this one last
     hidden: bool = False  # Whether the rays went through an obstacle as if it were not there
 
-    def ways_to(self, listener: Floats) -> Ways:
+    def paths_to(self, listener: Floats) -> MirrorPaths:
         """Compare the ways of all hits to a listener (3,), m, with those of a mirror."""
         angle = np.atleast_1d(np.asarray(self.solid_angle, dtype=np.float64))
         rows = self.footprint.rows
-        distance, cosine, found = ways_to(
+        distance, cosine, found = paths_to(
             rows, self.points, self.flat, self.mirrored, listener, angle
         )
-        return Ways(distance, cosine, *found)
+        return MirrorPaths(distance, cosine, *found)
 
     def __getitem__(self, chosen: Ints) -> Bounce:
         """Return the chosen hits."""
@@ -237,7 +237,7 @@ def gathered(bounces: Iterable[Bounce]) -> Iterator[Bounce]:
             continue
         alike = waiting.setdefault((bounce.number, bounce.hidden), [])
         alike.append(bounce)
-        if sum(len(part.ray) for part in alike) >= GATHERED:
+        if sum(len(part.ray) for part in alike) >= BATCH_HITS:
             yield _joined(alike)
             alike.clear()
     for alike in waiting.values():
@@ -292,12 +292,12 @@ def trace(
     if beyond is not None:
         hits, length = beyond(hits, directions)
     ray, emitted = hits.ray, directions.take(hits.ray, axis=0)
-    incoming, bundles = emitted, emit(emitted, length)
+    incoming, bundles = emitted, emit_bundles(emitted, length)
     triangles = hits.triangle[:, None]
     for number in range(1, bounces + 1):
         if len(ray) == 0:
             return
-        rows, turned, flat, mirrored = land(
+        rows, tilts, flat, mirrored = land(
             bundles, incoming, hits.normals, hits.flat, hits.gradients
         )
         yield Bounce(
@@ -310,7 +310,7 @@ def trace(
         hits = caster.first_hit(origins, onward)
         further = hits.ray
         incoming = onward.take(further, axis=0)
-        bundles = onto(rows, turned, further, hits.distance)
+        bundles = onto(rows, tilts, further, hits.distance)
         ray, emitted = ray.take(further), emitted.take(further, axis=0)
         length = length.take(further) + hits.distance
         triangles = np.concatenate(
@@ -343,7 +343,7 @@ def echo_paths(
     cells: Cells | None = None
     while True:
         weight = np.zeros(count)
-        bounces_found: list[tuple[Bounce, Ints]] = []
+        audible_bounces: list[tuple[Bounce, Ints]] = []
         solid_angle = cap.solid_angle / parts
         for start in range(0, len(directions), CHUNK):
             chunk = directions[start : start + CHUNK]
@@ -352,7 +352,7 @@ def echo_paths(
             ):
                 bounce = replace(bounce, ray=rays.take(bounce.ray + start))
                 if extra < SPLIT**2:  # no cell can be divided further
-                    bounces_found.append((bounce, np.arange(len(bounce.ray))))
+                    audible_bounces.append((bounce, np.arange(len(bounce.ray))))
                     continue
                 audible, doubt = judge(bounce)
                 # A ray hits once per bounce, so that no ray appears twice.
@@ -362,14 +362,14 @@ def echo_paths(
                     around = cap.neighbourhood(bounce.ray)
                     least = max(float(doubt.mean()), sys.float_info.min)
                     weight[around] = np.maximum(weight[around], least)
-                bounces_found.append((bounce, np.flatnonzero(audible)))
+                audible_bounces.append((bounce, np.flatnonzero(audible)))
         chosen = np.flatnonzero(weight)
         most = extra // SPLIT**2
         if len(chosen) > most:
             chosen = np.sort(chosen[np.argsort(-weight[chosen], kind="stable")[:most]])
         left = np.ones(len(weight), dtype=bool)
         left[chosen] = False
-        for bounce, heard in bounces_found:
+        for bounce, heard in audible_bounces:
             kept = heard[left[bounce.ray.take(heard)]]
             yield bounce if len(kept) == len(bounce.ray) else bounce[kept]
         if len(chosen) == 0:

@@ -35,14 +35,16 @@ from sononerf.simulation.paths import (
     reflection,
     unfaded,
 )
-from sononerf.simulation.shadows import LEAST, Shadow, behind, passing
+from sononerf.simulation.shadows import MIN_FACTOR, Shadow, behind, passing
 
 HIDDEN_SHARE = 0.15  # as many rays again, for surfaces behind obstacles
 HIDDEN_DIVIDED = 0.4  # of these, kept as above
 DIVIDED_SHARE = 0.6  # fraction of the rays that is kept where a few would be noise
-FINE = 0.3  # rad; a cell over which the path bends by less is fine enough
-SILENT = 7.0  # e to the minus this is -61 dB
-BALLS = 32  # number of balls that enclose the scene; rays that miss all of them are not traced
+MAX_BEND = 0.3  # rad; a cell over which the path bends by less is fine enough
+SILENT_EXPONENT = 7.0  # e to the minus this is -61 dB
+ENCLOSING_BALLS = (
+    32  # number of balls that enclose the scene; rays that miss all of them are not traced
+)
 
 
 class Rays:
@@ -97,9 +99,9 @@ class Rays:
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
         self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
         corners = vertices[np.asarray(scene.mesh.faces)]
-        self._balls = enclosing_balls(corners, bodies(scene.mesh), BALLS)
+        self._balls = enclosing_balls(corners, bodies(scene.mesh), ENCLOSING_BALLS)
         self._farthest = max(
-            math.inf if of_part.material.lobe_width else SILENT / float(of_part.fade.min())
+            math.inf if of_part.material.lobe_width else SILENT_EXPONENT / float(of_part.fade.min())
             for of_part in self.reflections
         )
         turns_per_metre = 2.0 * math.pi * RESOLVED_FREQUENCY / hearing.speed_of_sound
@@ -113,7 +115,7 @@ class Rays:
         self._basis = self._hats * factor[:, None]
         # The part that a shadow turns in phase is imaginary, so it is an odd function of frequency.
         odd_hats = synthesis.odd_hats if band is None else synthesis.odd_hats * band[:, None]
-        self._turned_basis = odd_hats * (1j * factor)[:, None]
+        self._quadrature_basis = odd_hats * (1j * factor)[:, None]
         # Rough surfaces use the filters of smooth ones, without their compensation of the fade.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
         self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
@@ -165,15 +167,15 @@ class Rays:
 
     def _echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         first, second, third = np.random.default_rng(seed).random(3)
-        sound, turned = self.hearing.silence(), self.hearing.silence()
+        sound, quadrature = self.hearing.silence(), self.hearing.silence()
         shadows = self._shadows(position, rotation)
         lit = self._paths(position, rotation, (first, second), self.bounces)
         hidden = self._hidden(position, rotation, (first, second), shadows[0])
         for bounce in chain(gathered(lit), gathered(hidden)):
-            self._hear(sound, turned, bounce, position, rotation, shadows)
+            self._hear(sound, quadrature, bounce, position, rotation, shadows)
         echo = self.hearing.echo(sound, self._basis)
-        if turned.heard:
-            echo += self.hearing.echo(turned, self._turned_basis)
+        if quadrature.heard:
+            echo += self.hearing.echo(quadrature, self._quadrature_basis)
         if self._diffracts:
             if self._diffraction is None:
                 self._diffraction = Diffraction(self.scene, self.caster, self.reflections)
@@ -250,12 +252,12 @@ class Rays:
     def _reaching(self, cap: CapSpiral, emitter: Floats) -> Ints:
         """Return which rays of a cap may hit the scene."""
         centres, radii = self._balls
-        ways = centres - emitter
-        distance = np.linalg.norm(ways, axis=1)
+        offsets = centres - emitter
+        distance = np.linalg.norm(offsets, axis=1)
         # The caster's single precision is far finer than this margin.
         sine = radii * 1.001 / np.maximum(distance, 1e-300)
         half_angle = np.where(sine < 1.0, np.arcsin(np.minimum(sine, 1.0)), math.pi)
-        return cap.reaching(ways / np.maximum(distance, 1e-300)[:, None], half_angle)
+        return cap.reaching(offsets / np.maximum(distance, 1e-300)[:, None], half_angle)
 
     def _hidden(
         self, position: Floats, rotation: Floats, offset: tuple[float, float], shadow: Shadow
@@ -275,7 +277,7 @@ class Rays:
             audible, doubt = self._audibility.judge(bounce, listeners)
             chosen = np.flatnonzero(audible)
             level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
-            audible[chosen] = level > LEAST
+            audible[chosen] = level > MIN_FACTOR
             passed = np.zeros(len(doubt))
             passed[chosen] = level
             return audible, doubt * passed
@@ -305,7 +307,7 @@ class Rays:
     def _hear(
         self,
         sound: Listener,
-        turned: Listener,
+        quadrature: Listener,
         bounce: Bounce,
         position: Floats,
         rotation: Floats,
@@ -334,7 +336,7 @@ class Rays:
                 level=gain,
                 position=position,
                 rotation=rotation,
-                shaded=None if shaded is None else (turned, *shaded),
+                shaded=None if shaded is None else (quadrature, *shaded),
             )
 
     def _heard(
@@ -344,10 +346,10 @@ class Rays:
 
         The last two are the shaded hits (M,) and the transmitted fraction (M, F), or None.
         """
-        ways = bounce.ways_to(ear)
-        heard = (ways.rise > 0.0) & (ways.detour < self._farthest)
+        paths = bounce.paths_to(ear)
+        heard = (paths.rise > 0.0) & (paths.detour < self._farthest)
         if self._reach < math.pi:
-            heard &= ways.cosine > math.cos(self._reach)
+            heard &= paths.cosine > math.cos(self._reach)
         near = np.flatnonzero(heard)
         seen = self.caster.visible(
             bounce.points.take(near, axis=0), ear, normals=bounce.flat.take(near, axis=0)
@@ -355,12 +357,12 @@ class Rays:
         seen, shaded = self._shaded(bounce, near, seen, lit, shadow)
         near = near[np.flatnonzero(seen)]
         triangle = bounce.triangles[near, -1]
-        gain = self._gain(triangle, ways.cosine.take(near), ways.detour.take(near))
-        bend = (ways.stiffness * np.asarray(bounce.solid_angle, dtype=np.float32)).take(near)
-        coarse = bend * self._wavenumber[-1] > FINE
+        gain = self._gain(triangle, paths.cosine.take(near), paths.detour.take(near))
+        bend = (paths.stiffness * np.asarray(bounce.solid_angle, dtype=np.float32)).take(near)
+        coarse = bend * self._wavenumber[-1] > MAX_BEND
         coarse = np.flatnonzero(coarse & self._smooth[self._part(triangle)])
         gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
-        return near, gain, ways.spread.take(near), shaded
+        return near, gain, paths.spread.take(near), shaded
 
     def _shaded(
         self, bounce: Bounce, near: Ints, seen: Bools, lit: Shadow | None, shadow: Shadow | None

@@ -34,7 +34,7 @@ def trace_once() -> None:
         ears=EarSettings(),
         call=CallSettings(),
         air=AirSettings(),
-        analysis=SpectrogramSettings(),
+        spectrogram=SpectrogramSettings(),
         noise=NoiseSettings(),
     )
     simulator = Simulator(Scene(trimesh.util.concatenate(balls), warns=False), head, options)

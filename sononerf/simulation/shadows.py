@@ -17,18 +17,18 @@ from sononerf.simulation.diffraction import Outlines
 from sononerf.simulation.hearing import RESOLVED_FREQUENCY
 from sononerf.simulation.impulse_response import NODE_SPACING
 
-CELL = 0.25
+CELL_SIZE = 0.25
 """Size of a piece of surface with one obstacle factor, over the root of wavelength times the radius
 of the scene, which is the width of the first Fresnel zone. Finer cells changed little."""
-LONGEST = 0.4 / NODE_SPACING
+MAX_DETOUR = 0.4 / NODE_SPACING
 """Longest detour over an outline that is kept, s; longer ones turn too fast between the nodes."""
-STEPS = 12
+DETOUR_STEPS = 12
 """Steps per wavelength in which detours are sorted."""
 LAYERS = 3
 """Number of surfaces that a ray through an obstacle may pass: into it, out of it, and one more."""
 UNKNOWN = -2
 """Index of a cell that has not been solved for."""
-LEAST = 0.02
+MIN_FACTOR = 0.02
 """Obstacle factor below which nothing is heard, -34 dB."""
 PEKERIS = (-0.2660 - 0.1478j, 0.1392 + 0.2246j, -0.0010 - 0.0536j)
 """Pekeris' function q* of a rigid surface as a polynomial of its argument, fitted within 0.013
@@ -89,9 +89,9 @@ class Shadow:
     ) -> None:
         self._caster, self._place, self._outlines = caster, place, outlines
         wavelength = speed_of_sound / RESOLVED_FREQUENCY
-        self._cell = CELL * math.sqrt(wavelength * size)
-        self._longest = LONGEST * speed_of_sound
-        self._step = wavelength / STEPS
+        self._cell = CELL_SIZE * math.sqrt(wavelength * size)
+        self._longest = MAX_DETOUR * speed_of_sound
+        self._step = wavelength / DETOUR_STEPS
         bins = math.ceil(self._longest / self._step) + 2
         detour = np.arange(bins) * self._step
         taper = np.clip(2.0 * (1.0 - detour / self._longest), 0.0, 1.0)
@@ -202,34 +202,34 @@ class Shadow:
     def _solve(self, points: Floats, body: Ints) -> NDArray[np.int32]:
         pieces = self._pieces
         assert pieces is not None
-        way = points - self._place
-        distance = np.linalg.norm(way, axis=1)
-        way /= distance[:, None]
+        direction = points - self._place
+        distance = np.linalg.norm(direction, axis=1)
+        direction /= distance[:, None]
         # The detour over an outline seen at the angle a is a² / 2 (1 / d1 - 1 / d).
         room = np.maximum(1.0 / self._nearest - 1.0 / distance, 0.0)
         angle = np.sqrt(2.0 * self._longest * room)
         reached = self._tree.query_ball_point(
-            way, 2.0 * np.sin(0.5 * np.minimum(angle, math.pi)), return_sorted=False
+            direction, 2.0 * np.sin(0.5 * np.minimum(angle, math.pi)), return_sorted=False
         )
-        count = np.array([len(found) for found in reached], dtype=np.int64)
+        count = np.array([len(near) for near in reached], dtype=np.int64)
         rows = np.full(len(points), -1, dtype=np.int32)
         if not count.any():
             return rows
         laid, used = _lay(
             points, self._place, body, np.cumsum([0, *count]),
-            np.concatenate([np.asarray(found, dtype=np.int64) for found in reached]),
+            np.concatenate([np.asarray(near, dtype=np.int64) for near in reached]),
             pieces.middle, pieces.along, pieces.behind, pieces.body, pieces.curve,
             len(self._turns), self._step, self._cell, self._longest, self._waist,
         )  # fmt: skip
         if len(used) == 0:
             return rows
-        lit = self._caster.visible(points[used] - self._cell * way[used], self._place)
-        found = lit[:, None] + _product(laid[0], self._turns)
+        lit = self._caster.visible(points[used] - self._cell * direction[used], self._place)
+        passed = lit[:, None] + _product(laid[0], self._turns)
         for weight, factor in zip(laid[1:], self._creep, strict=True):
             if weight.any():
-                found += _product(weight, factor)
+                passed += _product(weight, factor)
         rows[used] = len(self._table) + np.arange(len(used))
-        self._table = np.concatenate([self._table, found.astype(np.complex64)])
+        self._table = np.concatenate([self._table, passed.astype(np.complex64)])
         return rows
 
 
@@ -362,7 +362,7 @@ def passing(
                     factor *= heard_table[heard[i], k]
                 passed[kept, k] = factor
                 loudest = max(loudest, float(factor.real**2 + factor.imag**2))
-            if not loudest > LEAST**2:
+            if not loudest > MIN_FACTOR**2:
                 continue
             dim[kept] = count
             kept += 1

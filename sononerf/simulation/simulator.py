@@ -40,9 +40,9 @@ from sononerf.simulation.rays import Rays
 
 logger = logging.getLogger("sononerf")
 
-COARSE = 1.25
+MAX_BAND_RATIO = 1.25
 """Times ``RESOLVED_FREQUENCY``: bands that end above are warned of. The default band ends there."""
-UNSETTLED = 100_000
+DEFAULT_RAYS = 100_000
 """Rays per pose where neither a number is set nor an accuracy was measured, as in a preview."""
 VERSION = 5  # to be raised when the same settings give other echoes: stores are told apart by it
 
@@ -59,14 +59,14 @@ class Simulator:
 
     def __init__(self, scene: Scene, head: Head, options: SimulationSettings) -> None:
         """Prepare a scene for a head."""
-        self.head, hearing, analysis = head, hearing_of(head), head.analysis
+        self.head, hearing, spectrogram = head, hearing_of(head), head.spectrogram
         if head.plane is not None:
             scene = scene.with_image(head.plane)
-        if analysis.frequency_max > COARSE * RESOLVED_FREQUENCY:
+        if spectrogram.frequency_max > MAX_BAND_RATIO * RESOLVED_FREQUENCY:
             logger.warning(
                 "spectrogram.frequency_max=%g Hz: simulation.engine=%s resolves edges and shadows "
                 "up to %g Hz; echoes of edges above it are less exact",
-                *(analysis.frequency_max, options.engine, RESOLVED_FREQUENCY),
+                *(spectrogram.frequency_max, options.engine, RESOLVED_FREQUENCY),
             )
         self.scene, self.hearing, self.arrival = scene, hearing, Arrival(scene)
         self.low: LowBand | None = None
@@ -77,7 +77,7 @@ class Simulator:
                 hearing,
                 self.arrival,
                 sources=options.sources,
-                frequency_min=analysis.frequency_min,
+                frequency_min=spectrogram.frequency_min,
             )
             if isinstance(low, str):
                 self.note = f"rays at all frequencies, because {low}"
@@ -90,7 +90,7 @@ class Simulator:
         self.rays = Rays(
             scene,
             hearing,
-            rays=options.rays or UNSETTLED,
+            rays=options.rays or DEFAULT_RAYS,
             bounces=options.bounces,
             diffraction_points=options.diffraction_points,
             band=band,
@@ -281,20 +281,20 @@ def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) ->
     return simulator.spectrogram(position, rotation, seed=seed)
 
 
-FIRST = 30_000
+FIRST_RAYS = 30_000
 """Rays per pose of the first trial. Fewer rays hardly save time."""
-MOST = 300_000
+MAX_RAYS = 300_000
 """Largest number of rays per pose that the search for an accuracy takes. Sound that bounces between
 many bodies converges slowly: with this number ``ua`` has 0.8 dB, and 0.2 dB would take ten times as
 many."""
-POSES = 8
+TRIAL_POSES = 8
 """Poses that are simulated twice in a trial, spread evenly over all of them."""
 CONVERGENCE = 0.6
 """The difference is proportional to the number of rays to the power -CONVERGENCE, measured from
 30,000 to 300,000 rays on ``three_spheres``; on ``ua`` the power is 0.4."""
 LEAST_DB = 1e-6
 """Difference below which two simulations are the same, dB."""
-STEP = 1.3, 10.0
+RAYS_FACTOR = 1.3, 10.0
 """Least and greatest factor from one trial's number of rays to the next one's."""
 
 
@@ -316,11 +316,11 @@ def settle_rays(
     if options.rays is not None:
         tracer.rays = options.rays
         return tracer.rays
-    chosen = np.unique(np.linspace(0, len(poses) - 1, POSES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, TRIAL_POSES).round().astype(int))
     some = Poses(poses.positions[chosen], poses.rotations[chosen])
-    tracer.rays = FIRST
+    tracer.rays = FIRST_RAYS
     trials: list[float] = []  # errors, scaled to one ray per pose
-    while tracer.rays < MOST:
+    while tracer.rays < MAX_RAYS:
         with progress.task(f"trying {tracer.rays} rays per pose", 2 * len(chosen)) as task:
             found = max(_difference(simulator, some, task, workers), LEAST_DB)
         trials.append(found * tracer.rays**CONVERGENCE)
@@ -330,10 +330,11 @@ def settle_rays(
             progress.say(f"echoes: {tracer.rays} rays per pose, {error:.2g} dB between two seeds")
             return tracer.rays
         factor = (error / options.accuracy_db) ** (1.0 / CONVERGENCE)
-        tracer.rays = min(MOST, _rounded(tracer.rays * float(np.clip(factor, *STEP))))
+        tracer.rays = min(MAX_RAYS, _rounded(tracer.rays * float(np.clip(factor, *RAYS_FACTOR))))
     progress.say(
-        f"echoes: {MOST} rays per pose, the most that are chosen; fewer were less accurate than "
-        f"simulation.accuracy_db ({options.accuracy_db:g} dB); simulation.rays=NUMBER takes more"
+        f"echoes: {MAX_RAYS} rays per pose, the most that are chosen; fewer were less accurate "
+        f"than simulation.accuracy_db ({options.accuracy_db:g} dB); simulation.rays=NUMBER takes "
+        "more"
     )
     return tracer.rays
 

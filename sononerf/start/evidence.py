@@ -24,7 +24,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.field.field import Field
 from sononerf.numerics import Bools, Floats, Ints, Singles
 
-SHARED = 1.6
+AVERAGING_WIDTH = 1.6
 """Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. With
 1.3 the points of nineteen touching spheres lie 0.9 mm too far out, with 2.0 0.3 mm; but with 2.0
 two spheres that stand close are joined."""
@@ -66,7 +66,7 @@ def locate_sound(
     """
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
-    kernel = _neighbours(where, SHARED * resolution)
+    kernel = _neighbours(where, AVERAGING_WIDTH * resolution)
     parts: list[tuple[Floats, Floats, Floats, NDArray[np.intp]]] = []
     for pose, source in enumerate(sources):
         emitter = torch.as_tensor(source, dtype=places.dtype, device=places.device)
@@ -139,7 +139,7 @@ _COARSEST = 12  # least voxels along an axis of the coarsest grid
 _ACCURACY = 1e-3  # relative residual at which conjugate gradients stop
 
 
-def signed_distance(
+def fitted_distance(
     weight: Singles, target: Singles, bound: Singles, pull: float, empty: Singles, bending: float
 ) -> Singles:
     """Return the signed distance, positive outside.
@@ -152,7 +152,7 @@ def signed_distance(
         moment = _halved(np.asarray(weight * target, dtype=np.float32))
         aim: Singles = (moment / np.maximum(coarse, 1e-9)).astype(np.float32)
         # Values stay in fine voxels, so a Laplacian on twice the spacing is four times as small.
-        first = signed_distance(coarse, aim, _halved(bound), pull, _halved(empty), bending / 16)
+        first = fitted_distance(coarse, aim, _halved(bound), pull, _halved(empty), bending / 16)
         distance = ndimage.zoom(first, 2, order=1, mode="nearest", grid_mode=True)
         distance = distance[tuple(slice(n) for n in weight.shape)].astype(np.float32)
     else:
@@ -201,27 +201,27 @@ def _conjugate_gradients(
     scale = 1 / (diagonal + np.float32(42 * bending))  # 42: on the diagonal of Laplacian²
     x = x.copy()
     residual = right - product(x)
-    way = scale * residual
-    size = first = float((residual * way).sum())
+    search = scale * residual
+    size = first = float((residual * search).sum())
     for _ in range(steps):
         if not size > _ACCURACY**2 * first:
             break
-        turned = product(way)
-        length = np.float32(size / float((way * turned).sum()))
-        x += length * way
-        residual -= length * turned
+        image = product(search)
+        length = np.float32(size / float((search * image).sum()))
+        x += length * search
+        residual -= length * image
         scaled = scale * residual
         before, size = size, float((residual * scaled).sum())
-        way = scaled + np.float32(size / before) * way
+        search = scaled + np.float32(size / before) * search
     return x
 
 
-REACH = 2.0
+NEIGHBOUR_RADIUS = 2.0
 """Distance from a point within which others are compared with it, range resolutions."""
 ALIGNED = 0.3
 """Distance that two points may lie off one smooth surface, range resolutions; also the standard
 deviation of the distance between a pose's onset and its evidence."""
-FEW = 0.3
+HALF_RELIABLE_POWER = 0.3
 """Power of agreeing points over the mean power at which the reliability is halved."""
 AT_ONSET = 0.7
 """Reliability of a point at the onset of its own pose."""
@@ -260,7 +260,7 @@ def _agreement(evidence: Evidence, resolution: float) -> Floats:
     # Evenly over all poses: points come pose by pose.
     witnesses = np.unique(np.linspace(0, count - 1, min(count, _WITNESSES)).astype(np.intp))
     pairs = cKDTree(points).sparse_distance_matrix(
-        cKDTree(points[witnesses]), REACH * resolution, output_type="ndarray"
+        cKDTree(points[witnesses]), NEIGHBOUR_RADIUS * resolution, output_type="ndarray"
     )
     i, j = pairs["i"], witnesses[pairs["j"]]
     other = evidence.pose[i] != evidence.pose[j]
@@ -275,7 +275,7 @@ def _agreement(evidence: Evidence, resolution: float) -> Floats:
     usual = float(np.average(support, weights=power))
     if not usual > 0:
         return np.zeros(count)
-    return support / around * support / (support + FEW * usual)
+    return support / around * support / (support + HALF_RELIABLE_POWER * usual)
 
 
 _ALIKE = 0.5  # cosine of the greatest angle between the normals of a vertex and of a point
@@ -304,7 +304,7 @@ def poses_that_heard(
     for start in range(0, len(order), chunk):
         some = order[start : start + chunk]
         pairs = cKDTree(vertices[some]).sparse_distance_matrix(
-            tree, REACH * resolution, output_type="ndarray"
+            tree, NEIGHBOUR_RADIUS * resolution, output_type="ndarray"
         )
         i, j = pairs["i"], pairs["j"]
         ours, theirs = normals[some[i]], evidence.normals[j]

@@ -31,7 +31,7 @@ FEATURES = KINDS * HARMONICS + 6
 onsets, the number of pairs, and the direction of the pose with the least one."""
 USUAL = 200
 """Number of pairs at which the feature of their number is zero."""
-FREE = 1.0
+DENSE_DISTANCE = 1.0
 """Distance in front of the onsets, range resolutions, beyond which only every second place along
 each axis is computed: a third of the time, and the same F-score at 2 mm to 0.003."""
 _FARTHEST = 12.0  # voxels behind an onset, or in front of it, at most
@@ -148,19 +148,19 @@ class PlaceFeatures:
     direction: Singles
     pairs: int  # Number of pose-ear pairs
 
-    def turned(self, order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[Singles, Singles]:
+    def in_frame(self, order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[Singles, Singles]:
         """Return the input of the network in a turned or mirrored frame.
 
         Out: features (FEATURES, X, Y, Z), bound ((X, Y, Z), voxels).
         """
         back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
 
-        def turned(values: Singles) -> Singles:
+        def permuted(values: Singles) -> Singles:
             return np.flip(values.transpose(*order, *range(3, values.ndim)), back)
 
-        means = np.ascontiguousarray(turned(self.means)) @ _of_harmonics(order, signs)
-        behind = turned(self.behind)
-        direction = turned(self.direction)[..., list(order)] * np.array(signs, np.float32)
+        means = np.ascontiguousarray(permuted(self.means)) @ _of_harmonics(order, signs)
+        behind = permuted(self.behind)
+        direction = permuted(self.direction)[..., list(order)] * np.array(signs, np.float32)
         free = -behind[..., [0, 3]].clip(-_FARTHEST, _FARTHEST) / 6
         pairs = np.full((*behind.shape[:3], 1), math.log(self.pairs / USUAL) / 2, np.float32)
         pooled_ = np.arcsinh(50 * means.reshape(*behind.shape[:3], -1)) / 2.5
@@ -173,8 +173,8 @@ def _of_harmonics(order: tuple[int, ...], signs: tuple[int, ...]) -> Singles:
     generator = np.random.default_rng(0)
     directions = generator.normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turned = directions[:, list(order)] * signs
-    found = np.linalg.lstsq(harmonics(directions), harmonics(turned), rcond=None)[0]
+    permuted = directions[:, list(order)] * signs
+    found = np.linalg.lstsq(harmonics(directions), harmonics(permuted), rcond=None)[0]
     return found.astype(np.float32)
 
 
@@ -193,7 +193,7 @@ def halved(lattice: Lattice) -> Lattice:
 
 def free_places(hull: EchoHull, lattice: Lattice) -> Bools:
     """Return which places of the halved lattice lie well in front of the onsets, (X, Y, Z)."""
-    return np.asarray(clearance_grid(hull, halved(lattice)) < -FREE * 4 * lattice.spacing)
+    return np.asarray(clearance_grid(hull, halved(lattice)) < -DENSE_DISTANCE * 4 * lattice.spacing)
 
 
 def features_of(
@@ -209,7 +209,7 @@ def features_of(
     steps = np.indices(shape).reshape(3, -1).T
     middle = lattice.origin + spacing * (np.asarray(lattice.shape) - 1) / 2
     emitters, receivers = levels.emitters[some], levels.receivers[some]
-    onsets, table = hull.trusted[levels.poses[some]], levels.table(middle)[some]
+    onsets, table = hull.inlier_onsets[levels.poses[some]], levels.table(middle)[some]
     given = (emitters, receivers, onsets, table, levels.first, levels.spacing, unit)
     # In free space the nearest place with even steps stands for all eight around it.
     like = np.where(free.reshape(-1, 1), steps // 2 * 2, steps)

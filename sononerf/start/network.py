@@ -42,19 +42,19 @@ WEIGHTS = Path(__file__).with_name("network.safetensors")
 VOXEL = 0.25
 """Spacing of the signed distance, range resolutions: walls of half a range resolution have two
 voxels. Features have twice this spacing."""
-LARGEST = 3_000_000
+MAX_VOXELS = 3_000_000
 """Number of voxels, at most; a larger body gets a coarser lattice. The network takes about 1 µs of
 one core per voxel."""
 OUTSIDE = 4.0
 """Distance outside of the lattice, voxels; the training clips larger ones to it."""
-FULLER = 0.4
+FULLER_DISTANCE = 0.4
 """Distance outside of the surface at which the fuller one lies, voxels. A refinement thins a body
 but does not close gaps in it: four letters, refined from here, lose less of their strokes, with
 twice this distance they run together (``docs/notes/surface.md``)."""
 LOGIT = 0.7
 """Distance at which the logit of the probability that a voxel is outside is 1, voxels; the same in
 the training."""
-SURE = 3.0
+SURE_DISTANCE = 3.0
 """Distance from which a voxel is taken to be outside, voxels. Farther voxels are many, and their
 small probabilities would add up."""
 BLOCK = 16
@@ -76,14 +76,14 @@ def lattice_of(hull: EchoHull, box: Floats, resolution: float) -> Lattice | None
 
     In: box ((2, 3), m), resolution (m).
     """
-    step = max(resolution, float(np.prod(box[1] - box[0]) / LARGEST) ** (1 / 3))
+    step = max(resolution, float(np.prod(box[1] - box[0]) / MAX_VOXELS) ** (1 / 3))
     coarse = Lattice.over(box[0], box[1], step)
     left = np.argwhere(clearance_grid(hull, coarse) > -_ROOM * step)
     if not len(left):
         return None
     lower = coarse.origin + coarse.spacing * (left.min(axis=0) - 1.5)
     upper = coarse.origin + coarse.spacing * (left.max(axis=0) + 1.5)
-    spacing = max(VOXEL * resolution, float(np.prod(upper - lower) / LARGEST) ** (1 / 3))
+    spacing = max(VOXEL * resolution, float(np.prod(upper - lower) / MAX_VOXELS) ** (1 / 3))
     blocks = np.ceil((upper - lower) / (BLOCK * spacing)).astype(int)
     x, y, z = (int(n) * BLOCK for n in blocks)
     origin = (lower + upper) / 2 - spacing * (np.array([x, y, z]) - 1) / 2
@@ -166,9 +166,9 @@ def expected_level(distance: Singles) -> float:
 
     In: distance ((X, Y, Z), voxels).
     """
-    near = distance[distance < SURE].astype(np.float64)
+    near = distance[distance < SURE_DISTANCE].astype(np.float64)
     expected = int((1 / (1 + np.exp(near / LOGIT))).sum())
-    return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE
+    return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE_DISTANCE
 
 
 def lots_of(levels: RangeLevels) -> list[Ints]:
@@ -179,7 +179,7 @@ def lots_of(levels: RangeLevels) -> list[Ints]:
     return np.array_split(np.random.default_rng(0).permutation(poses), count)
 
 
-def signed_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) -> Singles:
+def predicted_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) -> Singles:
     """Return the signed distance by the network, (X, Y, Z) voxels, positive outside."""
     free = free_places(hull, lattice)
     lots = [features_of(levels, some, hull, lattice, free) for some in lots_of(levels)]
@@ -194,7 +194,7 @@ def signed_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) -> Si
 
 def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, ...]) -> Singles:
     """Return what the network makes of features in a turned or mirrored frame, turned back."""
-    seen, bound = places.turned(order, signs)
+    seen, bound = places.in_frame(order, signs)
     with torch.no_grad():
         made = _network()(torch.from_numpy(seen)[None], torch.from_numpy(bound)[None])
     back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
@@ -219,14 +219,16 @@ def levels_surfaces(
     lattice = lattice_of(hull, box, resolution)
     if lattice is None:
         raise NumericalError("no surface: the first echoes leave no room for a body")
-    distance = signed_distance(levels, hull, lattice)
+    distance = predicted_distance(levels, hull, lattice)
     if plane is not None:
         height = plane.height(lattice.points()).reshape(lattice.shape) / lattice.spacing
         distance = np.maximum(distance, -height).astype(np.float32)
-    if not (distance < SURE).any():
+    if not (distance < SURE_DISTANCE).any():
         raise NumericalError("no surface: the network finds no body in the levels of the echoes")
     level = expected_level(distance)
-    return _at_level(distance, level, lattice), _at_level(distance, level + FULLER, lattice)
+    return _at_level(distance, level, lattice), _at_level(
+        distance, level + FULLER_DISTANCE, lattice
+    )
 
 
 def _at_level(distance: Singles, level: float, lattice: Lattice) -> trimesh.Trimesh:

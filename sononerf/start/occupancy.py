@@ -31,7 +31,7 @@ from sononerf.errors import NumericalError
 from sononerf.field.field import Field
 from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
 from sononerf.numerics import Floats, Singles
-from sononerf.start.evidence import Evidence, locate_sound, reliability, signed_distance
+from sononerf.start.evidence import Evidence, fitted_distance, locate_sound, reliability
 
 _DENSE = 0.2  # density, over the median at the points, at which a plane has half of its full weight
 _PLANE = 1.0  # voxels, standard deviation of the Gaussian over which a point's plane counts
@@ -140,12 +140,12 @@ def winding_number(flux: Sequence[Singles]) -> Singles:
     return np.asarray(number[:x, :y, :z] - np.mean(far), dtype=np.float32)
 
 
-Belief = Literal["open", "filled", "hull"]
+StartMode = Literal["open", "filled", "hull"]
 """Weight of the field's sound beside the onsets. ``open``: the winding number opens hollows and
 gaps that the onsets leave closed. ``filled``: it does not. ``hull``: the onsets alone give the
 surface, which
 is exact for a convex body."""
-QUIET = 0.12
+MIN_EVIDENCE = 0.12
 """Weight below which evidence is left out, no unit: -37 dB relative to the loudest of a usual pose.
 The fit places most quieter sound at random."""
 SPAN = {"open": 2.4, "filled": 1.0}
@@ -156,10 +156,10 @@ BACKS = (0.02, 0.06)
 weight rises to the maximum."""
 OPENING = 0.03
 """Weight of a place that is outside by its winding number; evidence has weight 1 at its point."""
-THICKER = 1.5
+THICKENING = 1.5
 """Length that each side of a thin part is moved outward, and the surface moved back, voxels: two
 sides closer than the blur of their planes would cancel."""
-UNHEARD = 0.03
+MIN_PART_EVIDENCE = 0.03
 """Evidence of a part per area, over that of the part with most evidence, below which the part is
 left out."""
 _BENDING = 1.0  # of a voxel; evidence at its point has 1: it sets the unit of all weights
@@ -184,7 +184,7 @@ class Gathered:
     bound: Singles
     hull: EchoHull  # The free space
     resolution: float  # m: Range resolution
-    _found: dict[str, Singles] = field(default_factory=dict, init=False, repr=False)
+    _distances: dict[str, Singles] = field(default_factory=dict, init=False, repr=False)
 
 
 def gather_evidence(
@@ -201,13 +201,13 @@ def gather_evidence(
     In: places ((N, 3), m), lower, upper ((3,), m), spacing (m), resolution (m).
     """
     evidence = locate_sound(field, places, hull.sources, resolution=resolution)
-    evidence = evidence.where(evidence.weight > QUIET)
-    if not len(evidence.points) and not np.isfinite(hull.trusted).any():
+    evidence = evidence.where(evidence.weight > MIN_EVIDENCE)
+    if not len(evidence.points) and not np.isfinite(hull.inlier_onsets).any():
         raise NumericalError("no surface: no pose heard an echo from inside the region")
     lattice = Lattice.over(lower, upper, spacing)
     weight = evidence.weight * reliability(evidence, hull, resolution)
     thin = thinness(lattice, evidence.points, evidence.normals, weight)
-    move = THICKER * lattice.read(thin, evidence.points).clip(0, 1)
+    move = THICKENING * lattice.read(thin, evidence.points).clip(0, 1)
     points = evidence.points + spacing * move[:, None] * evidence.normals
     farthest = max(lattice.shape)
     bound = (-clearance_grid(hull, lattice) / spacing).clip(-farthest, farthest)
@@ -215,55 +215,57 @@ def gather_evidence(
     return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution)
 
 
-def estimate_occupancy(gathered: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
+def estimate_occupancy(gathered: Gathered, mode: StartMode = "filled") -> trimesh.Trimesh:
     """Return the closed surface of the body, m, normals outward."""
     lattice, spacing = gathered.lattice, gathered.lattice.spacing
     if not (gathered.bound < _CONTRADICTED * gathered.resolution / spacing).any():
         raise NumericalError(
             "no surface: the first echoes leave no room for a body; check poses and speed of sound"
         )
-    if belief == "hull":
-        if not np.isfinite(gathered.hull.trusted).any():
+    if mode == "hull":
+        if not np.isfinite(gathered.hull.inlier_onsets).any():
             raise NumericalError("no surface: no pose has a first echo")
         distance = gathered.bound
     else:
-        distance = thickened(gathered, belief)
+        distance = thickened(gathered, mode)
     if not (distance < 0).any():
         # The body is thinner than a voxel: the most likely places are taken, however few.
         inner = distance[(slice(MARGIN, -MARGIN),) * 3]
         most = np.partition(inner.ravel(), min(_LEAST, inner.size - 1))[: _LEAST + 1].max()
         distance = distance - most - np.float32(0.5)
     distance = without_hollows(_walled(distance))
-    distance = without_parts(distance, lattice, None if belief == "hull" else gathered)
+    distance = without_parts(distance, lattice, None if mode == "hull" else gathered)
     mesh = surface_of(distance, lattice)
-    if belief != "hull":
-        back = THICKER * spacing * lattice.read(gathered.thin, np.asarray(mesh.vertices)).clip(0, 1)
+    if mode != "hull":
+        back = (
+            THICKENING * spacing * lattice.read(gathered.thin, np.asarray(mesh.vertices)).clip(0, 1)
+        )
         mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
     return mesh
 
 
-def thickened(gathered: Gathered, belief: Literal["open", "filled"]) -> Singles:
+def thickened(gathered: Gathered, mode: Literal["open", "filled"]) -> Singles:
     """Return the signed distance by all evidence, (X, Y, Z) voxels; thin parts are too thick.
 
-    It is too small by ``THICKER`` times the thinness. A second call returns it without computing.
+    It is too small by ``THICKENING`` times the thinness. A second call returns the same array.
     """
-    if belief not in gathered._found:
-        gathered._found[belief] = _by_all_evidence(gathered, belief)
-    return gathered._found[belief]
+    if mode not in gathered._distances:
+        gathered._distances[mode] = _by_all_evidence(gathered, mode)
+    return gathered._distances[mode]
 
 
-def _by_all_evidence(gathered: Gathered, belief: Literal["open", "filled"]) -> Singles:
+def _by_all_evidence(gathered: Gathered, mode: Literal["open", "filled"]) -> Singles:
     lattice, normals = gathered.lattice, gathered.evidence.normals
-    bound = _walled(gathered.bound - np.float32(THICKER) * gathered.thin)
+    bound = _walled(gathered.bound - np.float32(THICKENING) * gathered.thin)
     used = gathered.weight > _NEGLIGIBLE
     weight, target = planes(lattice, gathered.points[used], normals[used], gathered.weight[used])
     empty = np.zeros_like(bound)
-    if belief == "open" and len(gathered.points):
+    if mode == "open" and len(gathered.points):
         winding = winding_of(lattice, gathered.points, normals, gathered.evidence.weight)
         backs = (-winding - np.float32(BACKS[0])) / np.float32(BACKS[1])
         empty = np.float32(OPENING) * backs.clip(0, 1)
-    span = SPAN[belief] * gathered.resolution / lattice.spacing
-    return signed_distance(weight, target, bound, span**-4, empty, _BENDING)
+    span = SPAN[mode] * gathered.resolution / lattice.spacing
+    return fitted_distance(weight, target, bound, span**-4, empty, _BENDING)
 
 
 def _walled(distance: Singles) -> Singles:
@@ -297,7 +299,7 @@ def without_parts(distance: Singles, lattice: Lattice, gathered: Gathered | None
         at = at.clip(0, np.asarray(lattice.shape) - 1)
         heard = np.bincount(labels[tuple(at.T)], gathered.weight, count + 1)[1:]
         dense = heard / size ** (2 / 3)
-        kept &= dense >= UNHEARD * dense[heard.argmax()]
+        kept &= dense >= MIN_PART_EVIDENCE * dense[heard.argmax()]
         best = heard if heard.any() else size
     if not kept.any():
         kept[best.argmax()] = True

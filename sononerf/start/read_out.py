@@ -58,14 +58,14 @@ class Reading:
 
     hull: EchoHull  # The onsets and the poses that they were heard from
     box: Floats  # (2, 3), m: Lower and upper corner of the region
-    resolution: float  # m: Range resolution of the analysis
+    resolution: float  # m: Range resolution
     # Levels of the echoes over range; None if only the free space is known
     levels: RangeLevels | None = None
     volume: Volume | None = None  # Energy of the field; None without a field, like the next one
     gathered: Gathered | None = None  # Evidence of field and onsets
     methods: tuple[StartMethod, ...] = STARTS  # Start surfaces that a refinement tries
     # Start surfaces that were made of it, by method
-    found: dict[StartMethod, trimesh.Trimesh] = field(default_factory=dict, repr=False)
+    starts: dict[StartMethod, trimesh.Trimesh] = field(default_factory=dict, repr=False)
 
 
 def read_field(
@@ -104,13 +104,13 @@ def start_surfaces(
     any_surface = False
     for method in methods:
         try:
-            if method not in reading.found:
-                reading.found[method] = _start(reading, method)
+            if method not in reading.starts:
+                reading.starts[method] = _start(reading, method)
         except NumericalError as error:
             first = first or error
             continue
         any_surface = True
-        yield method, reading.found[method]
+        yield method, reading.starts[method]
     if first is not None and not any_surface:
         raise first
 
@@ -118,8 +118,8 @@ def start_surfaces(
 def _start(reading: Reading, method: StartMethod) -> trimesh.Trimesh:
     if method == "levels" or method == "fuller":
         made = levels_surfaces(reading.levels, reading.hull, reading.box, reading.resolution)
-        reading.found.update(zip(LEVELS, made, strict=True))
-        return reading.found[method]
+        reading.starts.update(zip(LEVELS, made, strict=True))
+        return reading.starts[method]
     if reading.gathered is None:
         raise NumericalError(f"the start {method} needs a fitted field; without one take levels")
     if method == "sheet":
@@ -149,8 +149,8 @@ def read_isosurface(
     width = 2 * int(smoothing / volume.spacing / 2) + 1
     if width > 1:
         volume = volume.with_values(uniform_filter(volume.values, width, mode="nearest"))
-    found = automatic_level(volume) if level == "auto" else level
-    return isosurface(volume, found), volume, found
+    starts = automatic_level(volume) if level == "auto" else level
+    return isosurface(volume, starts), volume, starts
 
 
 def _grid_of(field: Field, spacing: float | None) -> tuple[Floats, Floats, float]:

@@ -33,12 +33,12 @@ from sononerf.numerics import Bools, Floats
 from sononerf.start.evidence import ALIGNED
 from sononerf.start.occupancy import Gathered
 
-THIN = 0.7
+MAX_SHEET_THICKNESS = 0.7
 """Distance of the other side below which a place is thin, range resolutions. The sides of a sheet
 share one echo, so neither is known to better than a fraction of the resolution."""
-MOST = 0.5
+MIN_SHEET_FRACTION = 0.5
 """Least fraction of the evidence that lies on the sheet."""
-SMOOTH = 0.5
+SMOOTHING_LENGTH = 0.5
 """Length over which a sheet bends as easily as the evidence is dense, range resolutions."""
 _LEAST = 0.05  # range resolutions, half of the least thickness; only keeps the sides apart
 _FACING = 0.3  # cosine to the plane's normal, below which evidence is of the rim
@@ -84,7 +84,7 @@ def fit_sheet(gathered: Gathered) -> trimesh.Trimesh:
     middle = np.where(within, (low + high) / 2, 0.0)
     thin = _HELD * np.exp(-0.5 * ((high - low) / (2 * frame.step)) ** 2) * within
     held = thin + 1e-6
-    stiffness = (SMOOTH * resolution / frame.step) ** 4
+    stiffness = (SMOOTHING_LENGTH * resolution / frame.step) ** 4
     bending = _bending(shape)
     half = _LEAST * resolution
     z = middle
@@ -104,10 +104,13 @@ def fit_sheet(gathered: Gathered) -> trimesh.Trimesh:
         z = spsolve(matrix.tocsc(), right)
         half = float(np.average(side * (height - read @ z), weights=counts))
         half = max(half, _LEAST * resolution)
-        if scale < resolution and half > THIN * resolution:
+        if scale < resolution and half > MAX_SHEET_THICKNESS * resolution:
             break  # twice too thick
     near = np.abs(read @ z + side * half - height) < ALIGNED * resolution
-    if 2 * half > THIN * resolution or np.average(near, weights=weight) < MOST:
+    if (
+        2 * half > MAX_SHEET_THICKNESS * resolution
+        or np.average(near, weights=weight) < MIN_SHEET_FRACTION
+    ):
         raise NumericalError("no surface: the evidence does not lie on one sheet")
     return _slab(frame, z.reshape(shape), half)
 

@@ -14,19 +14,19 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from sononerf import storage
-from sononerf.display import Shown
+from sononerf.display import NotebookRepr
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.region import ENOUGH
+from sononerf.echoes.region import MIN_POSES
 from sononerf.errors import InputError, NumericalError, expect
 from sononerf.geometry.lattice import Volume
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats
 from sononerf.start.evidence import ALIGNED, poses_that_heard
-from sononerf.start.occupancy import QUIET
+from sononerf.start.occupancy import MIN_EVIDENCE
 from sononerf.start.read_out import Method, Reading
-from sononerf.start.sheet import THIN
+from sononerf.start.sheet import MAX_SHEET_THICKNESS
 
 MeshFormat = Literal["ply", "stl", "glb"]
 
@@ -153,7 +153,7 @@ FORMATS: tuple[MeshFormat, ...] = get_args(MeshFormat)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface(Shown):
+class Surface(NotebookRepr):
     """A reconstructed surface, or one of your own: ``Surface(mesh)``.
 
     Attributes:
@@ -249,7 +249,7 @@ def finished_surface(
     if openness.kind == "one-sided":
         heard = confidence
         if gathered is not None:
-            reliable = gathered.evidence.where(gathered.weight > QUIET)
+            reliable = gathered.evidence.where(gathered.weight > MIN_EVIDENCE)
             heard = poses_that_heard(mesh, reliable, resolution)
         part = known_part(mesh, heard, hull, resolution=resolution)
         voxel = resolution / 2 if gathered is None else gathered.lattice.spacing
@@ -263,14 +263,14 @@ def finished_surface(
     return Surface(mesh, reading.volume, method, **keywords)
 
 
-FACING = 0.1
+MIN_FACING = 0.1
 """Least cosine between a triangle's normal and the direction to a pose for the triangle to face
 it."""
 UNSEEN_SHARE = 0.25
 """Fraction of the area that cannot have been heard above which a surface is one-sided."""
 THIN_SHARE = 0.75
 """Fraction of the area that is thin above which a surface is a sheet."""
-STANDING = 0.5
+STANDING_HEIGHT = 0.5
 """Height over the support up to which a triangle stands on it, range resolutions: sound does not
 resolve a smaller gap."""
 _LIFT = 1e-3  # depth at which the search for the other side begins, over the root of the area
@@ -331,11 +331,11 @@ def judge_openness(
         image = trimesh.Trimesh(plane.mirrored(mesh.vertices), mesh.faces[:, ::-1], process=False)
         both = RayCaster(trimesh.util.concatenate([mesh, image]))
         heads = np.concatenate([sources, plane.mirrored(sources)])
-        stands = plane.height(np.asarray(mesh.triangles)).max(axis=1) < STANDING * resolution
+        stands = plane.height(np.asarray(mesh.triangles)).max(axis=1) < STANDING_HEIGHT * resolution
         unseen = ~(stands | _seen(both, middles, normals, heads))
     lift = _LIFT * np.sqrt(areas)
     inward = caster.first_hit(middles - lift[:, None] * normals, -normals)
-    thin = inward.ray[inward.distance + lift[inward.ray] < THIN * resolution]
+    thin = inward.ray[inward.distance + lift[inward.ray] < MAX_SHEET_THICKNESS * resolution]
     total = areas.sum()
     return Openness(unseen, float(areas[unseen].sum() / total), float(areas[thin].sum() / total))
 
@@ -344,14 +344,14 @@ def _seen(caster: RayCaster, middles: Floats, normals: Floats, sources: Floats) 
     seen = np.zeros(len(middles), dtype=bool)
     for start in range(0, len(middles), _CHUNK):
         some = slice(start, start + _CHUNK)
-        ways = sources[None] - middles[some, None]
-        ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-        facing = np.einsum("tpi,ti->tp", ways, normals[some])
+        to_sources = sources[None] - middles[some, None]
+        to_sources /= np.linalg.norm(to_sources, axis=2, keepdims=True)
+        facing = np.einsum("tpi,ti->tp", to_sources, normals[some])
         order = np.argsort(-facing, axis=1)
         left = np.arange(len(facing))
         for first in range(0, len(sources), _POSES):
             best = order[left, first : first + _POSES]
-            row, column = np.nonzero(np.take_along_axis(facing[left], best, axis=1) > FACING)
+            row, column = np.nonzero(np.take_along_axis(facing[left], best, axis=1) > MIN_FACING)
             if not len(row):
                 break
             which = start + left[row]
@@ -374,7 +374,7 @@ def known_part(
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     bounded = hull.clearance(middles)[0] < resolution
-    enough = heard >= min(ENOUGH, int(heard.max(initial=0)))
+    enough = heard >= min(MIN_POSES, int(heard.max(initial=0)))
     if not heard.any():
         return np.asarray(bounded)
     places = np.asarray(mesh.vertices)[enough]

@@ -3,15 +3,10 @@
 
 from __future__ import annotations
 
-import time
-
-import pytest
-import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from sononerf.callbacks import add_mesh, event_folder, log_results, serve, writing
-from tests.browser import CHROMIUM, browser
+from sononerf.callbacks import event_folder, log_results
 
 
 def events_of(run):
@@ -62,32 +57,3 @@ def test_settings_stand_beside_the_results(tmp_path):
     metadata = events.summary_metadata["_hparams_/session_start_info"]
     content = plugin_data_pb2.HParamsPluginData.FromString(metadata.plugin_data.content)
     assert dict(content.session_start_info.hparams).keys() == {"fit.seed", "scene.name"}
-
-
-@pytest.mark.slow  # a browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
-def test_tensorboard_shows_the_run_by_its_name_and_asks_nobody_else(training, tmp_path):
-    training(logger=True).train()
-    with writing(tmp_path) as writer:
-        add_mesh(writer, "mesh/field", trimesh.creation.icosphere(radius=0.02), 8)
-    log_results(tmp_path, {"fit.seed": 3}, {"prediction": {"mae_db": 0.5}})
-    url = serve(tmp_path)
-    assert url.startswith("http://127.0.0.1:")
-    shown = """
-        (function text(node) {
-            let found = node.textContent || "";
-            for (const child of node.querySelectorAll("*"))
-                if (child.shadowRoot) found += text(child.shadowRoot);
-            return found;
-        })(document.body)"""
-    with browser(tmp_path / "profile") as page:
-        page.size(1400, 900)
-        page.open(url)
-        page.until(f"({shown}).includes('validation_error_dB')", 60)
-        page.until(f"({shown}).includes('{tmp_path.name}')")
-        for tab, words in (("mesh", "Point of view"), ("hparams", "fit.seed")):
-            page.open("about:blank")
-            page.open(f"{url}#{tab}")
-            page.until(f"({shown}).includes('{words}')", 60)
-            time.sleep(2)
-        assert not page.outside()

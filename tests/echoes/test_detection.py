@@ -117,7 +117,7 @@ def test_the_chance_of_onsets_is_that_of_false_alarms(heard):
     assert found.chance(5.8e-3) == pytest.approx(poisson.sf(heard - 1, usual), rel=1e-6)
 
 
-HEAD = Head(analysis=SpectrogramSettings(range_min=0.2, range_max=0.4))
+HEAD = Head(spectrogram=SpectrogramSettings(range_min=0.2, range_max=0.4))
 POSES = 40
 
 

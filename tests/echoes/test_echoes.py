@@ -21,8 +21,8 @@ def store_of(path, split):
     count = len(split)
     store = EnsembleStore.create(
         path,
-        poses_positions=np.random.default_rng(0).standard_normal((count, 3)),
-        poses_rotations=np.broadcast_to(np.eye(3), (count, 3, 3)),
+        positions=np.random.default_rng(0).standard_normal((count, 3)),
+        rotations=np.broadcast_to(np.eye(3), (count, 3, 3)),
         split=split,
         range=np.linspace(0.2, 0.3, 5),
         frequency=np.linspace(1e4, 2e4, 3),
@@ -87,7 +87,7 @@ HEAD = Head(
     ears={"receivers": [(0.0, 0.02, 0.0)], "directivity": "omnidirectional"},
     call={"kind": "hyperbolic", "duration": 4e-4},
     air={"temperature_c": 25.0},
-    analysis={"range_min": 0.3, "range_max": 0.36},
+    spectrogram={"range_min": 0.3, "range_max": 0.36},
 )
 POSES = Poses.sphere(12, radius=0.35)
 

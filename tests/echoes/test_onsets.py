@@ -85,12 +85,12 @@ def test_a_point_echo_is_told_by_window_and_band():
 
 def noise_power(count):
     """Mean power over the rows of white noise in one window each, (N,)."""
-    analysis = SpectrogramSettings()
-    samples = np.random.default_rng(0).standard_normal((count, analysis.window))
-    spectrum = np.fft.rfft(samples * np.hamming(analysis.window), analysis.fft)
-    axis = np.fft.rfftfreq(analysis.fft, 1 / analysis.sampling_rate)
-    band = np.isin(np.round(axis), np.round(frequency_axis(analysis)))
-    assert band.sum() == len(frequency_axis(analysis))
+    spectrogram = SpectrogramSettings()
+    samples = np.random.default_rng(0).standard_normal((count, spectrogram.window))
+    spectrum = np.fft.rfft(samples * np.hamming(spectrogram.window), spectrogram.fft)
+    axis = np.fft.rfftfreq(spectrogram.fft, 1 / spectrogram.sampling_rate)
+    band = np.isin(np.round(axis), np.round(frequency_axis(spectrogram)))
+    assert band.sum() == len(frequency_axis(spectrogram))
     return (np.abs(spectrum[:, band]) ** 2).mean(axis=1)
 
 
@@ -110,9 +110,9 @@ def test_so_many_onsets_can_be_noise(found, by_noise):
 
 
 def test_the_echo_of_a_sweep_is_that_of_the_rows_it_sounds_in():
-    call, analysis = CallSettings(kind="linear", frequency_end=40e3), SpectrogramSettings()
-    rows = effective_window(call, analysis)[frequency_axis(analysis) >= 40e3]
-    found = PointEcho.of(call, analysis, 343.0)
+    call, spectrogram = CallSettings(kind="linear", frequency_end=40e3), SpectrogramSettings()
+    rows = effective_window(call, spectrogram)[frequency_axis(spectrogram) >= 40e3]
+    found = PointEcho.of(call, spectrogram, 343.0)
     np.testing.assert_allclose(found.window, (rows**2).mean(axis=0), rtol=1e-12)
     assert found.resolution > ECHO.resolution
 
@@ -126,10 +126,10 @@ def test_lengths_go_with_the_speed_of_sound():
 @pytest.mark.parametrize("tilt", [-1.0, 0.0, 1.0])
 def test_an_onset_does_not_depend_on_which_channels_are_loud(tilt):
     """Low channels of a gammatone swell slowly: an echo that they make up begins early."""
-    analysis = SpectrogramSettings(kind="gammatone", range_min=0.2, range_max=0.4)
-    point = PointEcho.of(CallSettings(), analysis, 343.0)
-    axis, frequency = range_axis(analysis, 343.0), frequency_axis(analysis)
-    window = effective_window(CallSettings(), analysis)
+    spectrogram = SpectrogramSettings(kind="gammatone", range_min=0.2, range_max=0.4)
+    point = PointEcho.of(CallSettings(), spectrogram, 343.0)
+    axis, frequency = range_axis(spectrogram, 343.0), frequency_axis(spectrogram)
+    window = effective_window(CallSettings(), spectrogram)
     offset = (np.arange(window.shape[1]) - (window.shape[1] - 1) / 2) * 343.0 / 2e6
     at = 0.3 + np.linspace(0, 0.0007, 12)
     gain = (frequency / 30e3) ** tilt

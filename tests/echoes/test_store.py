@@ -24,8 +24,8 @@ POSES, RANGES, FREQUENCIES = 9, 7, 5
 def axes(**changes):
     generator = np.random.default_rng(0)
     return {
-        "poses_positions": generator.normal(size=(POSES, 3)),
-        "poses_rotations": np.tile(np.eye(3), (POSES, 1, 1)),
+        "positions": generator.normal(size=(POSES, 3)),
+        "rotations": np.tile(np.eye(3), (POSES, 1, 1)),
         "split": np.arange(POSES) % 3,
         "range": np.linspace(0.15, 0.75, RANGES),
         "frequency": np.linspace(10e3, 100e3, FREQUENCIES),
@@ -59,8 +59,8 @@ def test_what_is_written_is_read(tmp_path):
     store = EnsembleStore.open(tmp_path / "s")
     wanted = axes()
     assert len(store) == POSES
-    np.testing.assert_array_equal(store.positions, wanted["poses_positions"])
-    np.testing.assert_array_equal(store.rotations, wanted["poses_rotations"])
+    np.testing.assert_array_equal(store.positions, wanted["positions"])
+    np.testing.assert_array_equal(store.rotations, wanted["rotations"])
     np.testing.assert_array_equal(store.split, wanted["split"])
     np.testing.assert_array_equal(store.range, wanted["range"])
     np.testing.assert_array_equal(store.frequency, wanted["frequency"])
@@ -170,8 +170,8 @@ def test_wrong_shapes_and_numbers_are_refused(tmp_path):
         with pytest.raises(InputError, match="no pose"):
             store.read_pose(index)
     for changes, message in [
-        ({"poses_positions": np.zeros((POSES, 2))}, "position: shape"),
-        ({"poses_rotations": np.zeros((POSES - 1, 3, 3))}, "differ in length"),
+        ({"positions": np.zeros((POSES, 2))}, "position: shape"),
+        ({"rotations": np.zeros((POSES - 1, 3, 3))}, "differ in length"),
         ({"split": np.full(POSES, 3)}, "split: expected 0"),
         ({"range": []}, "range: shape"),
     ]:
@@ -192,9 +192,9 @@ def test_create_opens_the_same_and_refuses_another(tmp_path):
     assert EnsembleStore.create(tmp_path / "s", **axes()).missing() == []
     with pytest.raises(IncompatibleError, match="other settings"):
         EnsembleStore.create(tmp_path / "s", **axes(attributes={"echo_hash": "b2"}))
-    moved = axes()["poses_positions"] + 1.0
+    moved = axes()["positions"] + 1.0
     with pytest.raises(IncompatibleError, match="position differs"):
-        EnsembleStore.create(tmp_path / "s", **axes(poses_positions=moved))
+        EnsembleStore.create(tmp_path / "s", **axes(positions=moved))
 
 
 def test_create_refuses_a_folder_of_something_else(tmp_path):
@@ -258,8 +258,8 @@ KILL_POSES, KILL_SHAPE = 30, (2, 40, 16)
 def store_of(path, levels):
     store = EnsembleStore.create(
         path,
-        poses_positions=np.zeros((3, 3)),
-        poses_rotations=np.stack([np.eye(3)] * 3),
+        positions=np.zeros((3, 3)),
+        rotations=np.stack([np.eye(3)] * 3),
         split=[0, 0, 2],
         range=[0.1, 0.2],
         frequency=[1e4, 2e4],
@@ -352,7 +352,7 @@ def test_it_goes_to_other_processes_whole(whole, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
-        ({"poses_positions": np.zeros((POSES, 3))}, "position"),
+        ({"positions": np.zeros((POSES, 3))}, "position"),
         ({"split": np.zeros(POSES, int)}, "split"),
         ({"frequency": np.linspace(10e3, 90e3, 5)}, "frequency"),
     ],

@@ -16,8 +16,8 @@ SPLIT = np.array([0, 0, 1, 0, 2, 0, 0, 2, 0, 1, 0, 0])
 def make(path, split=SPLIT):
     store = EnsembleStore.create(
         path,
-        poses_positions=np.random.default_rng(0).normal(size=(POSES, 3)),
-        poses_rotations=np.tile(np.eye(3), (POSES, 1, 1)),
+        positions=np.random.default_rng(0).normal(size=(POSES, 3)),
+        rotations=np.tile(np.eye(3), (POSES, 1, 1)),
         split=split,
         range=0.2 + 0.01 * np.arange(RANGES),
         frequency=1e4 * (1 + np.arange(FREQUENCIES)),

@@ -18,7 +18,7 @@ from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
 
-HEAD = Head(analysis={"range_min": 0.3, "range_max": 0.36})
+HEAD = Head(spectrogram={"range_min": 0.3, "range_max": 0.36})
 BOX = ((-0.02,) * 3, (0.02,) * 3)
 SMALL = {"field_options": {"finest": 0.01, "levels": 2}, "renderer_options": {"start": 2000}}
 

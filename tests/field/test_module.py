@@ -215,8 +215,8 @@ def store(tmp_path_factory):
         )
     store = EnsembleStore.create(
         tmp_path_factory.mktemp("data") / "store",
-        poses_positions=positions,
-        poses_rotations=rotations,
+        positions=positions,
+        rotations=rotations,
         split=np.arange(12) % 6 == 5,
         range=LISTENER.range.numpy(),
         frequency=FREQUENCY.numpy(),

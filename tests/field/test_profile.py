@@ -216,17 +216,17 @@ def heard_by_lobes(make, listener, **options):
 @LOBES
 def test_what_is_heard_follows_the_places_that_are_alive(make, listener):
     _, renderer, hear = heard_by_lobes(make, listener)
-    silent = torch.zeros_like(renderer.alive)
+    silent = torch.zeros_like(renderer.kept)
     few = silent.clone()
     few[:3] = True
     heard = [hear()]
-    renderer.alive[3:] = False  # in place
+    renderer.kept[3:] = False  # in place
     heard.append(hear())
-    renderer.alive = ~few  # another tensor, as often changed as the first when it was new
+    renderer.kept = ~few  # another tensor, as often changed as the first when it was new
     heard.append(hear())
     torch.testing.assert_close(heard[1] ** 2 + heard[2] ** 2, heard[0] ** 2)
     assert not torch.equal(heard[1], heard[2])
-    renderer.alive = silent
+    renderer.kept = silent
     assert hear().max() < 1e-10
 
 
@@ -235,7 +235,7 @@ def test_a_sample_has_the_right_power_on_average(make, listener):
     """Some of the places that are loudest in the books being dead."""
     _, renderer, hear = heard_by_lobes(make, listener, points=25)
     renderer.energy = torch.linspace(1, 2, 125, dtype=torch.float64) ** 4
-    renderer.alive[60:80] = renderer.alive[120:] = False
+    renderer.kept[60:80] = renderer.kept[120:] = False
     renderer.eval()
     whole = hear().detach() ** 2
     renderer.train()
@@ -402,12 +402,12 @@ def test_a_place_60_db_below_its_surroundings_is_dropped(listener, formula, loud
     dropped = ((cube - cube[loud]).abs() <= 1).all(-1)
     dropped[[loud, other]] = False
     assert 20 < dropped.sum() < len(dropped) - 20
-    assert torch.equal(renderer.alive, ~dropped)
+    assert torch.equal(renderer.kept, ~dropped)
 
 
 def test_the_lattice_goes_with_the_weights(listener, formula, cloud):
     field, renderer = cloud
-    renderer.alive[5:50] = False
+    renderer.kept[5:50] = False
     other = ProfileRenderer(REGION, listener).double()
     other.load_state_dict(renderer.state_dict())
     assert not other.prepare(field, None, 7)
@@ -474,7 +474,7 @@ def test_gradients_of_a_lead(listener, formula, gradients_are_right):
     ],
 )
 def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, front):
-    analysis = {} if kind == "impulse" else {"window": 160, "frequency_min": 45e3}
+    spectrogram = {} if kind == "impulse" else {"window": 160, "frequency_min": 45e3}
     call = {"kind": kind, "duration": 1e-3, "frequency_end": 30e3}
     if kind == "harmonics":  # the second is heard 57 mm farther off at 50 kHz, 114 mm at 100 kHz
         call = {"kind": "linear", "duration": 1e-3, "frequency_start": 100e3}
@@ -484,7 +484,7 @@ def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, 
             "scene": {"name": "test"},
             "simulation": {"engine": "rays", "rays": 20_000},  # nothing creeps around
             "call": call,
-            "spectrogram": {"kind": front, **analysis},
+            "spectrogram": {"kind": front, **spectrogram},
         },
         "test",
     )

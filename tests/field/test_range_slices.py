@@ -23,8 +23,8 @@ def store(tmp_path_factory):
     split[9] = 2
     store = EnsembleStore.create(
         tmp_path_factory.mktemp("data") / "store",
-        poses_positions=np.arange(3.0 * POSES).reshape(POSES, 3),
-        poses_rotations=np.arange(9.0 * POSES).reshape(POSES, 3, 3),
+        positions=np.arange(3.0 * POSES).reshape(POSES, 3),
+        rotations=np.arange(9.0 * POSES).reshape(POSES, 3, 3),
         split=split,
         range=0.2 + 0.01 * np.arange(RANGES),
         frequency=1e4 * (1 + np.arange(FREQUENCIES)),

@@ -17,7 +17,7 @@ from sononerf.settings.schema import SpectrogramSettings
 
 def echoes():
     """Twenty poses that hear a point at the origin."""
-    head = Head(analysis=SpectrogramSettings(range_min=0.25, range_max=0.35))
+    head = Head(spectrogram=SpectrogramSettings(range_min=0.25, range_max=0.35))
     places = 0.3 * np.random.default_rng(0).normal(size=(20, 3))
     places *= 0.3 / np.linalg.norm(places, axis=1, keepdims=True)
     loud = np.exp(-(((head.range - 0.3) / 0.004) ** 2))

@@ -90,7 +90,7 @@ def test_images_lie_as_far_behind_a_plane():
     np.testing.assert_allclose(across, 0.0, atol=1e-12)
     ways = np.random.default_rng(1).normal(size=(20, 3))
     moved = TILTED.mirrored(points + ways) - images
-    np.testing.assert_allclose(ways @ TILTED.turn, moved, atol=1e-12)
+    np.testing.assert_allclose(ways @ TILTED.reflection, moved, atol=1e-12)
 
 
 def test_a_body_in_the_air_has_an_image_of_its_own():

@@ -209,9 +209,9 @@ def test_silence_before_the_call_counts_as_time(written):
 
 def test_a_point_echo_of_a_file_is_that_of_its_sweep(written):
     call = written(call_waveform(SWEEP, 1e6).astype(np.float32), rate=1_000_000)
-    analysis = SpectrogramSettings(frequency_min=45e3, frequency_max=85e3, window=160)
+    spectrogram = SpectrogramSettings(frequency_min=45e3, frequency_max=85e3, window=160)
     assert has_ghosts(call, [50e3])
-    found, expected = effective_window(call, analysis), effective_window(SWEEP, analysis)
+    found, expected = effective_window(call, spectrogram), effective_window(SWEEP, spectrogram)
     width = min(found.shape[1], expected.shape[1])
     assert found.shape[1] % 2 == expected.shape[1] % 2
     found, expected = (
@@ -263,6 +263,6 @@ def test_bad_files_are_refused_in_one_line(written, samples, words):
 
 def test_a_call_outside_the_band_is_refused(written):
     call = written(call_waveform(SWEEP, RATE).astype(np.float32))
-    analysis = SpectrogramSettings(frequency_min=150e3, frequency_max=200e3)
+    spectrogram = SpectrogramSettings(frequency_min=150e3, frequency_max=200e3)
     with pytest.raises(InputError, match=r"holds sound at 2\d.\d to 1\d\d.\d kHz, nothing within"):
-        Head(call=call, analysis=analysis)
+        Head(call=call, spectrogram=spectrogram)

@@ -19,7 +19,7 @@ from sononerf.head.ears import (
     piston,
     receiver_places,
 )
-from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, echo_samples, frequency_axis, range_axis
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 from tests.head.directivity.patterns import (
     AZIMUTH,
@@ -112,21 +112,21 @@ def test_look_up_equals_scipys_interpolator(ears):
 
 def test_analysed_ears_are_what_the_window_makes_of_an_echo():
     """An echo in the middle of the window, filtered by an ear, through window and transform."""
-    analysis = SpectrogramSettings()
+    spectrogram = SpectrogramSettings()
     head = EarSettings(beam_radius=0.0)
-    wanted = frequency_axis(analysis)
-    heard, lag = analysed_ears(head, CallSettings(), analysis)
+    wanted = frequency_axis(spectrogram)
+    heard, lag = analysed_ears(head, CallSettings(), spectrogram)
     assert lag is None
-    step = analysis.sampling_rate / analysis.fft
-    fine = ear_tables(head, np.arange(1, analysis.fft // 2 + 1) * step)
+    step = spectrogram.sampling_rate / spectrogram.fft
+    fine = ear_tables(head, np.arange(1, spectrogram.fft // 2 + 1) * step)
     row, column = 40, 95  # a little below and to the left of straight ahead
     gain = fine.ears[0, :, row, column].astype(float)
     spectrum = np.concatenate((gain[:1], gain))  # below the first bin as at it
-    middle = (analysis.window - 1) / 2
-    phase = np.exp(-2j * np.pi * np.arange(len(spectrum)) / analysis.fft * middle)
-    echo = np.fft.irfft(spectrum * phase, analysis.fft)[: analysis.window]
-    window = np.hamming(analysis.window)
-    magnitude = np.abs(np.fft.rfft(echo * window, analysis.fft))
+    middle = (spectrogram.window - 1) / 2
+    phase = np.exp(-2j * np.pi * np.arange(len(spectrum)) / spectrogram.fft * middle)
+    echo = np.fft.irfft(spectrum * phase, spectrogram.fft)[: spectrogram.window]
+    window = np.hamming(spectrogram.window)
+    magnitude = np.abs(np.fft.rfft(echo * window, spectrogram.fft))
     first = round(wanted[0] / step)
     expected = magnitude[first : first + len(wanted)]
     # A notch of 8 kHz is filled by a window that resolves 28 kHz: this is no small matter.
@@ -140,25 +140,25 @@ def test_analysed_ears_are_what_the_window_makes_of_an_echo():
 @pytest.mark.parametrize("kind", ["linear", "hyperbolic"])
 def test_analysed_ears_are_what_a_sweeps_rows_hear(kind):
     """A sweep, filtered by an ear, through the dechirped spectrogram: each row's power and time."""
-    analysis = SpectrogramSettings(window=150, hop=1, frequency_min=45e3, range_max=0.6)
+    spectrogram = SpectrogramSettings(window=150, hop=1, frequency_min=45e3, range_max=0.6)
     call = CallSettings(kind=kind, duration=1e-3, frequency_end=20e3)
     head = EarSettings(beam_radius=0.0)
-    heard, lag = analysed_ears(head, call, analysis)
+    heard, lag = analysed_ears(head, call, spectrogram)
     delay = sweep_delay(call, heard.frequency)
-    echo = np.zeros(echo_samples(analysis, 343.0, float(delay.max())))
-    waveform = call_waveform(call, analysis.sampling_rate)
+    echo = np.zeros(echo_samples(spectrogram, 343.0, float(delay.max())))
+    waveform = call_waveform(call, spectrogram.sampling_rate)
     echo[2000 : 2000 + len(waveform)] = waveform
-    frequency = np.fft.rfftfreq(len(echo), 1 / analysis.sampling_rate)
+    frequency = np.fft.rfftfreq(len(echo), 1 / spectrogram.sampling_rate)
     fine = ear_tables(head, np.maximum(frequency, 1.0) + 1e-6 * np.arange(len(frequency)))
     row, column = 40, 95
     gain = fine.ears[0, :, row, column].astype(float)
     # The beam of no radius fades towards the back and sounds alike at all frequencies.
     both = np.stack((echo, np.fft.irfft(np.fft.rfft(echo) * gain, len(echo))))
-    power = spectrogram(both, analysis, 343.0, delay) ** 2  # (2, R, F)
+    power = dechirped_spectrogram(both, spectrogram, 343.0, delay) ** 2  # (2, R, F)
     expected = np.sqrt(power[1].sum(axis=0) / power[0].sum(axis=0))
     found = heard.ears[0, :, row, column]
     raw = np.interp(heard.frequency, frequency, gain)
-    time = 2.0 * range_axis(analysis, 343.0) / 343.0 - 2000.0 / analysis.sampling_rate
+    time = 2.0 * range_axis(spectrogram, 343.0) / 343.0 - 2000.0 / spectrogram.sampling_rate
     late = time @ power[1] / power[1].sum(axis=0)
     np.testing.assert_allclose(found, expected, atol=0.0015)
     assert np.abs(raw - expected).max() > 0.05

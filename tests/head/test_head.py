@@ -8,7 +8,7 @@ from sononerf.geometry.poses import rotation_from_euler
 from sononerf.head.air import air_absorption, speed_of_sound
 from sononerf.head.decibels import (
     ACTIVE_DB,
-    EXCEEDED,
+    FALSE_ACTIVE_RATE,
     active_level,
     compress,
     expand,
@@ -35,7 +35,7 @@ def test_the_air_takes_as_many_decibels_as_it_says():
 
 def test_the_mean_lag_is_that_of_the_directions_that_are_heard():
     assert Head().mean_lag == 0.0
-    head = Head(call=CallSettings(kind="linear", duration=1e-3), analysis=SpectrogramSettings())
+    head = Head(call=CallSettings(kind="linear", duration=1e-3), spectrogram=SpectrogramSettings())
     gains = head.row_gains.beam * head.row_gains.ears
     loud = gains > 0.5 * gains.max()
     assert head.lag[loud].min() < head.mean_lag < head.lag[loud].max()
@@ -44,7 +44,7 @@ def test_the_mean_lag_is_that_of_the_directions_that_are_heard():
 
 def test_the_echo_of_a_point_has_the_spacing_of_samples_and_half_its_power_in_a_resolution():
     head = Head(air={"speed_of_sound": 340.0})
-    assert head.point_echo.spacing == pytest.approx(170.0 / head.analysis.sampling_rate)
+    assert head.point_echo.spacing == pytest.approx(170.0 / head.spectrogram.sampling_rate)
     triangle = np.concatenate((np.arange(0.0, 8.0), np.arange(8.0, -1.0, -1.0))) / 8.0
     echo = PointEcho(window=triangle**2, rows=None, spacing=0.002, looks=1.0)
     assert echo.resolution == pytest.approx(0.018)  # nine of its magnitudes are one half or more
@@ -57,7 +57,7 @@ def test_the_top_of_a_window_may_be_its_end():
 
 
 def test_the_shortest_wavelength_is_that_of_the_highest_row():
-    head = Head(air={"speed_of_sound": 340.0}, analysis={"frequency_max": 80e3})
+    head = Head(air={"speed_of_sound": 340.0}, spectrogram={"frequency_max": 80e3})
     assert head.wavelength == pytest.approx(340.0 / head.frequency.max())
 
 
@@ -131,7 +131,7 @@ def test_noise_makes_one_cell_in_a_thousand_active():
     parts = rng.standard_normal((2, 2, 400_000)) * np.sqrt(0.5)
     magnitude = rms * np.hypot(*parts)  # Rayleigh's distribution
     active = compress(magnitude, 1.0) >= active_level(rms, 1.0)[:, 0]
-    assert 0.8 * EXCEEDED < active.mean() < 1.2 * EXCEEDED
+    assert 0.8 * FALSE_ACTIVE_RATE < active.mean() < 1.2 * FALSE_ACTIVE_RATE
 
 
 def test_without_noise_or_with_little_of_it_three_decibels_are_active():

@@ -6,7 +6,7 @@ import pytest
 import scipy.signal
 
 from sononerf.head.call import sweep_delay
-from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, echo_samples, frequency_axis, range_axis
 from sononerf.head.head import Head
 from sononerf.head.reception import best_window, effective_window, row_duration, warn_of_call
 from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
@@ -17,13 +17,15 @@ HOP = 4e-6  # s
 SWEEPS = [(kind, length) for kind in ("linear", "hyperbolic") for length in (0.2e-3, 1e-3, 3e-3)]
 
 
-def analysis(**changes):
+def spectrogram(**changes):
     return SpectrogramSettings.model_validate({**ANALYSIS.model_dump(), **changes})
 
 
 def reception(call=None, noise=None, **changes):
     return Head(
-        call=call or CallSettings(), analysis=analysis(**changes), noise=noise or NoiseSettings()
+        call=call or CallSettings(),
+        spectrogram=spectrogram(**changes),
+        noise=noise or NoiseSettings(),
     )
 
 
@@ -68,10 +70,10 @@ def measured(call, window, delay=3000.37e-6):
     """
     found = reception(call, window=window, hop=1, range_min=0.25, range_max=0.9)
     echo = point_echo(call, delay, found.samples)[None]
-    magnitude = spectrogram(echo, found.analysis, SPEED, found.delay)[0]
-    time = 2 * range_axis(found.analysis, SPEED) / SPEED
-    frequency = frequency_axis(found.analysis)
-    lobe = 2 * found.analysis.sampling_rate / window
+    magnitude = dechirped_spectrogram(echo, found.spectrogram, SPEED, found.delay)[0]
+    time = 2 * range_axis(found.spectrogram, SPEED) / SPEED
+    frequency = frequency_axis(found.spectrogram)
+    lobe = 2 * found.spectrogram.sampling_rate / window
     swept = np.linspace(40e3, 150e3, 5000)
     from_end = call.duration / 2 - abs(sweep_delay(call, swept) - call.duration / 2)
     swept = swept[from_end > call.taper * call.duration / 2]
@@ -92,7 +94,7 @@ def test_a_point_echo_is_dechirped(kind, duration, ends, best):
     window = best_window(call, ANALYSIS) if best else 64
     offset, lasts, frequency = measured(call, window)
     assert abs(offset).max() < HOP
-    expected = row_duration(call, analysis(window=window), frequency)
+    expected = row_duration(call, spectrogram(window=window), frequency)
     assert (lasts / expected).max() < 1.1
     assert (lasts / expected).min() > 0.9
 
@@ -104,7 +106,7 @@ def test_the_best_window_keeps_a_point_echo_shortest(kind, duration):
     frequency = np.maximum(frequency_axis(ANALYSIS), 40e3)  # the first bin lies a little below
 
     def lasts(window):
-        rows = row_duration(call, analysis(window=window, fft=1024), frequency)
+        rows = row_duration(call, spectrogram(window=window, fft=1024), frequency)
         return np.sqrt(np.mean(rows**2))
 
     assert min(range(16, 600), key=lasts) == pytest.approx(best, abs=1)
@@ -115,7 +117,7 @@ def test_an_impulse_without_noise_is_analysed_to_the_bit_as_it_came():
     echo = np.random.default_rng(0).normal(size=(2, found.samples))
     waveform, magnitude = found.receive(echo, seed=1)
     np.testing.assert_array_equal(waveform, echo)
-    np.testing.assert_array_equal(magnitude, spectrogram(echo, found.analysis, SPEED))
+    np.testing.assert_array_equal(magnitude, dechirped_spectrogram(echo, found.spectrogram, SPEED))
 
 
 def test_a_sweep_is_emitted_and_dechirped():
@@ -123,8 +125,8 @@ def test_a_sweep_is_emitted_and_dechirped():
     found = reception(call, window=237)
     waveform, magnitude = found.receive(impulse(found), seed=1)
     np.testing.assert_allclose(waveform[0], point_echo(call, 2500e-6, found.samples), atol=1e-9)
-    assert found.samples == echo_samples(found.analysis, SPEED, found.delay.max())
-    peaks = range_axis(found.analysis, SPEED)[magnitude[1].argmax(axis=0)]
+    assert found.samples == echo_samples(found.spectrogram, SPEED, found.delay.max())
+    peaks = range_axis(found.spectrogram, SPEED)[magnitude[1].argmax(axis=0)]
     # Within two hops: the greatest value of a flat top is not its middle. The first row lies
     # on the sweep's end.
     assert abs(peaks - 2500e-6 * SPEED / 2)[4:].max() < 2 * HOP * SPEED / 2
@@ -174,13 +176,13 @@ def test_noise_depends_on_the_seed_alone():
 @pytest.mark.parametrize(("kind", "window"), [("linear", 177), ("hyperbolic", 237), ("linear", 64)])
 def test_the_effective_window_is_a_point_echos_row(kind, window):
     call = CallSettings(kind=kind, duration=1e-3)
-    found = effective_window(call, analysis(window=window))
+    found = effective_window(call, spectrogram(window=window))
     count = found.shape[1]
     np.testing.assert_allclose(found, found[:, ::-1])
     np.testing.assert_allclose(found[:, [(count - 1) // 2, count // 2]], 1.0)
     heard = reception(call, window=window, hop=1)
     rows = heard.receive(impulse(heard), seed=0)[1][0]
-    time = 2 * range_axis(heard.analysis, SPEED) / SPEED - 2500e-6
+    time = 2 * range_axis(heard.spectrogram, SPEED) / SPEED - 2500e-6
     offset = (np.arange(count) - (count - 1) / 2) / 1e6
     for row in (16, 20):  # 70 and 78 kHz
         there = np.interp(offset, time, rows[:, row])
@@ -209,7 +211,7 @@ def test_a_slow_sweep_wants_a_longer_window(caplog):
 
 
 def test_a_window_that_is_far_too_long_is_told_too(caplog):
-    warn_of_call(CallSettings(kind="linear", duration=0.2e-3), analysis(window=200))
+    warn_of_call(CallSettings(kind="linear", duration=0.2e-3), spectrogram(window=200))
     assert caplog.records[0].getMessage().endswith("set spectrogram.window=79")
 
 

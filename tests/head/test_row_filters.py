@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sononerf.head.call import call_waveform, sweep_delay
-from sononerf.head.front_end import echo_samples, range_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, echo_samples, range_axis
 from sononerf.head.reception import effective_window
 from sononerf.head.row_filters import band_mean, row_filters, row_frequencies, row_widths
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
@@ -35,10 +35,10 @@ def test_a_filter_is_as_wide_as_its_q_says(q):
     np.testing.assert_allclose(width, filters.frequency / q, rtol=0.02)
 
 
-@pytest.mark.parametrize("analysis", [SpectrogramSettings(), gammatone()])
-def test_widths_are_counted_above_half_height(analysis):
-    filters = row_filters(analysis)
-    duration, bandwidth = row_widths(analysis, filters.frequency)
+@pytest.mark.parametrize("spectrogram", [SpectrogramSettings(), gammatone()])
+def test_widths_are_counted_above_half_height(spectrogram):
+    filters = row_filters(spectrogram)
+    duration, bandwidth = row_widths(spectrogram, filters.frequency)
     for row in (5, 30):
         assert wide(filters.envelope[row], 0.5) == pytest.approx(1e6 * duration[row], abs=2)
         transform = np.fft.fftshift(abs(np.fft.fft(filters.envelope[row], 1 << 16)))
@@ -55,13 +55,13 @@ def test_the_length_is_that_of_a_window_as_wide():
 
 @pytest.mark.parametrize("call", [CallSettings(), CallSettings(kind="linear", duration=0.2e-3)])
 def test_an_impulse_peaks_at_its_range_in_every_channel(call):
-    analysis = gammatone(hop=1, frequency_min=42e3 if call.kind == "linear" else 10e3)
-    delay = sweep_delay(call, row_frequencies(analysis))
-    echo = np.zeros((1, echo_samples(analysis, SPEED, float(delay.max()))))
+    spectrogram = gammatone(hop=1, frequency_min=42e3 if call.kind == "linear" else 10e3)
+    delay = sweep_delay(call, row_frequencies(spectrogram))
+    echo = np.zeros((1, echo_samples(spectrogram, SPEED, float(delay.max()))))
     waveform = call_waveform(call, 1e6)
     echo[0, 2000 : 2000 + len(waveform)] = 3.0 * waveform
-    found = spectrogram(echo, analysis, SPEED, delay)[0]
-    ranges = range_axis(analysis, SPEED)
+    found = dechirped_spectrogram(echo, spectrogram, SPEED, delay)[0]
+    ranges = range_axis(spectrogram, SPEED)
     late = ranges[found.argmax(axis=0)] - 0.343
     if call.kind == "impulse":
         assert abs(late).max() <= 0.0002  # a sample
@@ -71,12 +71,12 @@ def test_an_impulse_peaks_at_its_range_in_every_channel(call):
 
 
 def test_what_a_channel_reads_before_the_emission_is_silent():
-    analysis = gammatone(range_min=0.01, range_max=0.2, hop=3)
-    ranges = range_axis(analysis, SPEED)
+    spectrogram = gammatone(range_min=0.01, range_max=0.2, hop=3)
+    ranges = range_axis(spectrogram, SPEED)
     assert ranges[0] < 0.011
-    echo = np.random.default_rng(0).normal(size=(1, echo_samples(analysis, SPEED)))
-    filters = row_filters(analysis)
-    found = spectrogram(echo, analysis, SPEED)[0]
+    echo = np.random.default_rng(0).normal(size=(1, echo_samples(spectrogram, SPEED)))
+    filters = row_filters(spectrogram)
+    found = dechirped_spectrogram(echo, spectrogram, SPEED)[0]
     padded = np.pad(echo[0], (-filters.origin, 0))
     sample = np.arange(filters.envelope.shape[1]) / 1e6
     for frame in (0, 40, len(ranges) - 1):
@@ -89,12 +89,12 @@ def test_what_a_channel_reads_before_the_emission_is_silent():
 
 
 def test_the_effective_window_is_an_impulses_row():
-    analysis = gammatone(hop=1)
-    window = effective_window(CallSettings(), analysis)
-    echo = np.zeros((1, echo_samples(analysis, SPEED)))
+    spectrogram = gammatone(hop=1)
+    window = effective_window(CallSettings(), spectrogram)
+    echo = np.zeros((1, echo_samples(spectrogram, SPEED)))
     echo[0, 2500] = 1.0
-    found = spectrogram(echo, analysis, SPEED)[0]
-    middle = round(2500 - range_axis(analysis, SPEED)[0] * 2e6 / SPEED)
+    found = dechirped_spectrogram(echo, spectrogram, SPEED)[0]
+    middle = round(2500 - range_axis(spectrogram, SPEED)[0] * 2e6 / SPEED)
     side = (window.shape[1] - 1) // 2
     np.testing.assert_allclose(window, found[middle - side : middle + side + 1].T, atol=1e-9)
     assert window[0, side + 300] > 10 * window[0, side - 300]  # it fades slower than it swells

@@ -7,7 +7,13 @@ import scipy.signal
 
 from sononerf.head.call import call_waveform, sweep_delay
 from sononerf.head.decibels import compress
-from sononerf.head.front_end import echo_samples, frequency_axis, range_axis, smearing, spectrogram
+from sononerf.head.front_end import (
+    dechirped_spectrogram,
+    echo_samples,
+    frequency_axis,
+    range_axis,
+    smearing,
+)
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 DEFAULT = SpectrogramSettings()
@@ -50,13 +56,13 @@ def test_equals_scipys(settings):
     np.testing.assert_allclose(ranges[kept], range_axis(settings, 343.0), rtol=1e-12)
     bins = [np.abs(frequency - f).argmin() for f in frequency_axis(settings)]
     expected = np.moveaxis(expected[:, bins], 1, 2)[:, kept] * window_sum
-    np.testing.assert_allclose(spectrogram(echo, settings, 343.0), expected, atol=1e-12)
+    np.testing.assert_allclose(dechirped_spectrogram(echo, settings, 343.0), expected, atol=1e-12)
 
 
 def test_a_sample_peaks_at_its_range_in_all_frequencies_alike():
     echo = np.zeros((1, echo_samples(DEFAULT, 343.0)))
     echo[0, 2000] = 3.0
-    found = spectrogram(echo, DEFAULT, 343.0)[0]
+    found = dechirped_spectrogram(echo, DEFAULT, 343.0)[0]
     ranges = range_axis(DEFAULT, 343.0)
     # The range of sample 2000 is 0.343 m; frames stand half a hop off it at most.
     assert abs(ranges[found[:, 20].argmax()] - 0.343) <= 0.000343
@@ -70,9 +76,9 @@ def test_speed_of_sound_scales_the_ranges():
 
 def test_short_echo_is_refused():
     needed = echo_samples(DEFAULT, 343.0)
-    assert spectrogram(np.zeros((2, needed)), DEFAULT, 343.0).shape == (2, 875, 47)
+    assert dechirped_spectrogram(np.zeros((2, needed)), DEFAULT, 343.0).shape == (2, 875, 47)
     with pytest.raises(ValueError, match=f"needs {needed}"):
-        spectrogram(np.zeros((2, needed - 1)), DEFAULT, 343.0)
+        dechirped_spectrogram(np.zeros((2, needed - 1)), DEFAULT, 343.0)
 
 
 def test_no_frame_between_the_ranges_is_refused():
@@ -85,9 +91,9 @@ def test_a_row_is_advanced_by_its_own_delay():
     needed = echo_samples(DEFAULT, 343.0, delay[-1])
     assert needed == echo_samples(DEFAULT, 343.0) + 138
     echo = np.random.default_rng(0).normal(size=(2, needed))
-    found = spectrogram(echo, DEFAULT, 343.0, delay)
+    found = dechirped_spectrogram(echo, DEFAULT, 343.0, delay)
     for row, advance in enumerate(3 * np.arange(47)):
-        expected = spectrogram(echo[:, advance:], DEFAULT, 343.0)
+        expected = dechirped_spectrogram(echo[:, advance:], DEFAULT, 343.0)
         np.testing.assert_allclose(found[..., row], expected[..., row], atol=1e-11)
 
 
@@ -95,24 +101,29 @@ def test_a_row_is_advanced_between_two_samples():
     half = np.full(47, 0.5e-6)
     time = np.arange(2 * echo_samples(DEFAULT, 343.0, 0.5e-6) + 2) / 2e6
     fine = np.exp(-0.5 * ((time - 2.1e-3) / 5e-6) ** 2) * np.cos(2 * np.pi * 60e3 * time)
-    between = spectrogram(fine[None, 1::2], DEFAULT, 343.0)
-    found = spectrogram(fine[None, ::2], DEFAULT, 343.0, half)
+    between = dechirped_spectrogram(fine[None, 1::2], DEFAULT, 343.0)
+    found = dechirped_spectrogram(fine[None, ::2], DEFAULT, 343.0, half)
     np.testing.assert_allclose(found, between, atol=1e-9 * between.max())
-    assert abs(spectrogram(fine[None, ::2], DEFAULT, 343.0) - between).max() > 0.01 * between.max()
+    assert (
+        abs(dechirped_spectrogram(fine[None, ::2], DEFAULT, 343.0) - between).max()
+        > 0.01 * between.max()
+    )
 
 
 def test_no_delay_is_no_change_to_the_bit():
     echo = np.random.default_rng(0).normal(size=(2, echo_samples(DEFAULT, 343.0)))
-    expected = spectrogram(echo, DEFAULT, 343.0)
-    np.testing.assert_array_equal(spectrogram(echo, DEFAULT, 343.0, np.zeros(47)), expected)
+    expected = dechirped_spectrogram(echo, DEFAULT, 343.0)
+    np.testing.assert_array_equal(
+        dechirped_spectrogram(echo, DEFAULT, 343.0, np.zeros(47)), expected
+    )
 
 
 def test_wrong_delays_are_refused():
     echo = np.zeros((2, echo_samples(DEFAULT, 343.0, 1e-3) - 1))
     with pytest.raises(ValueError, match=f"needs {echo.shape[1] + 1}"):
-        spectrogram(echo, DEFAULT, 343.0, np.full(47, 1e-3))
+        dechirped_spectrogram(echo, DEFAULT, 343.0, np.full(47, 1e-3))
     with pytest.raises(ValueError, match="negative"):
-        spectrogram(echo, DEFAULT, 343.0, np.full(47, -1e-6))
+        dechirped_spectrogram(echo, DEFAULT, 343.0, np.full(47, -1e-6))
 
 
 def test_compression_on_paper():
@@ -131,25 +142,25 @@ def notched(frequency):
     return 1.0 - 0.8 * np.exp(-0.5 * ((frequency - 60e3) / 8e3) ** 2)
 
 
-def heard(call, analysis):
+def heard(call, spectrogram):
     """Rows (2, R, F) of a call as it is and through the notch, their axis of time, s."""
-    delay = sweep_delay(call, frequency_axis(analysis))
-    echo = np.zeros(echo_samples(analysis, SPEED, float(delay.max())))
+    delay = sweep_delay(call, frequency_axis(spectrogram))
+    echo = np.zeros(echo_samples(spectrogram, SPEED, float(delay.max())))
     waveform = call_waveform(call, 1e6)
     echo[2000 : 2000 + len(waveform)] = waveform
     gain = notched(np.fft.rfftfreq(len(echo), 1e-6))
     both = np.stack((echo, np.fft.irfft(np.fft.rfft(echo) * gain, len(echo))))
-    time = 2 * range_axis(analysis, SPEED) / SPEED - 2000e-6
-    return spectrogram(both, analysis, SPEED, delay), time
+    time = 2 * range_axis(spectrogram, SPEED) / SPEED - 2000e-6
+    return dechirped_spectrogram(both, spectrogram, SPEED, delay), time
 
 
 @pytest.mark.parametrize("q", [2.0, 4.0, 9.0])
 def test_a_gammatones_channel_hears_the_mean_about_its_frequency(q):
-    analysis = SpectrogramSettings(kind="gammatone", q=q, hop=1)
-    found = smearing(CallSettings(), analysis)
+    spectrogram = SpectrogramSettings(kind="gammatone", q=q, hop=1)
+    found = smearing(CallSettings(), spectrogram)
     assert found.later is None
     np.testing.assert_allclose(abs(found.weight.sum(axis=1)), 1.0)
-    rows, time = heard(CallSettings(), analysis)
+    rows, time = heard(CallSettings(), spectrogram)
     expected = rows[1][np.abs(time).argmin()]
     gain = abs((found.weight * notched(found.frequency[found.rows])).sum(axis=1))
     np.testing.assert_allclose(gain, expected, atol=0.02)
@@ -158,11 +169,11 @@ def test_a_gammatones_channel_hears_the_mean_about_its_frequency(q):
 
 
 def test_a_gammatones_channel_hears_the_power_of_a_sweep():
-    analysis = SpectrogramSettings(kind="gammatone", frequency_min=45e3, hop=1)
+    spectrogram = SpectrogramSettings(kind="gammatone", frequency_min=45e3, hop=1)
     call = CallSettings(kind="linear", duration=1e-3, frequency_end=25e3)
-    found = smearing(call, analysis)
+    found = smearing(call, spectrogram)
     np.testing.assert_allclose(found.weight.sum(axis=1), 1.0)
-    rows, time = heard(call, analysis)
+    rows, time = heard(call, spectrogram)
     power = rows**2
     expected = np.sqrt(power[1].sum(axis=0) / power[0].sum(axis=0))
     heard_power = found.weight * notched(found.frequency[found.rows]) ** 2
@@ -177,10 +188,10 @@ def test_a_gammatones_channel_hears_the_power_of_a_sweep():
 
 def test_above_half_the_sampling_rate_there_is_nothing_to_hear():
     rate = 220e3
-    analysis = SpectrogramSettings(
+    spectrogram = SpectrogramSettings(
         kind="gammatone", sampling_rate=rate, frequency_max=100e3, hop=1, window=64, fft=64
     )
-    found = smearing(CallSettings(), analysis)
+    found = smearing(CallSettings(), spectrogram)
     beyond = found.frequency >= rate / 2
     assert beyond.any()
     np.testing.assert_allclose(found.frequency[beyond], rate / 2)

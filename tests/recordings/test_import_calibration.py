@@ -8,8 +8,8 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, emit
+from sononerf.run.import_plan import plan_import
 from sononerf.run.import_recordings import spectrogram_of
-from sononerf.run.understand import understand
 from tests.recordings.recorded import RATE, SETTINGS, arrays, waveforms
 
 LIMITS = ("spectrogram.range_min=0.3", "spectrogram.range_max=0.55")
@@ -20,7 +20,7 @@ def recorded(tmp_path):
     def read(*overrides, **changes):
         np.savez(tmp_path / "a.npz", **arrays(**changes))
         given = [*SETTINGS, *LIMITS, *overrides]
-        return understand("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=given)
+        return plan_import("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=given)
 
     return read
 

@@ -13,8 +13,8 @@ from sononerf.head.call import call_waveform, emit
 from sononerf.head.ears import beam_gain, ear_gain, ear_tables
 from sononerf.head.front_end import frequency_axis
 from sononerf.head.head import Head
-from sononerf.recordings.ranges import calibrate
-from sononerf.run.understand import understand
+from sononerf.recordings.ranges import calibrate_recording
+from sononerf.run.import_plan import plan_import
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 from sononerf.settings.sections import ReferenceSettings
 from tests.recordings.recorded import SETTINGS, arrays, waveforms
@@ -22,12 +22,12 @@ from tests.recordings.recorded import SETTINGS, arrays, waveforms
 
 def limits(tmp_path, *overrides, **changes):
     np.savez(tmp_path / "a.npz", **arrays(**changes))
-    found = understand(
+    found = plan_import(
         "numpy", tmp_path / "a.npz", tmp_path / "s", overrides=[*SETTINGS, *overrides]
     )
-    analysis = found.settings.spectrogram
+    spectrogram = found.settings.spectrogram
     assert len(found.head.range) > 10
-    return analysis.range_min, analysis.range_max
+    return spectrogram.range_min, spectrogram.range_max
 
 
 def test_they_hold_the_echoes_and_little_more(tmp_path):
@@ -96,8 +96,8 @@ class Still(Head):
 
 
 def calibration(call, echo):
-    return calibrate(
-        echo, TARGET, Still(ears=EarSettings(notch_depth=0.0), call=call, analysis=ANALYSIS)
+    return calibrate_recording(
+        echo, TARGET, Still(ears=EarSettings(notch_depth=0.0), call=call, spectrogram=ANALYSIS)
     )
 
 

@@ -17,7 +17,7 @@ from sononerf.recordings.recording import (
     check_numbers,
     clipped_pings,
     cut,
-    mix,
+    mixed_channels,
 )
 
 RATE = 1e5
@@ -57,10 +57,10 @@ def test_what_was_not_recorded_is_silent():
 
 def test_channels_are_chosen_and_averaged():
     samples = np.arange(8.0).reshape(4, 2)
-    np.testing.assert_array_equal(mix(samples, (3, (0, 1))), [[6, 7], [1, 2]])
-    assert mix(samples, None) is samples
+    np.testing.assert_array_equal(mixed_channels(samples, (3, (0, 1))), [[6, 7], [1, 2]])
+    assert mixed_channels(samples, None) is samples
     with pytest.raises(InputError, match="no channel 4; the recordings have 0 to 3"):
-        mix(samples, (4,))
+        mixed_channels(samples, (4,))
 
 
 def test_offset_gain_and_background():

@@ -13,7 +13,7 @@ from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
 from sononerf.recordings.pose_check import alternatives, check_poses, mirrored, shifted
 from sononerf.recordings.pose_tables import Columns, to_poses
-from sononerf.recordings.ranges import predict
+from sononerf.recordings.ranges import predict_ranges
 from sononerf.recordings.recording import Recording, channels_of, check_channels, faults_of_channels
 from sononerf.settings.sections import ImportSettings
 from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
@@ -201,7 +201,7 @@ def predicted(poses, first):
     out = poses.positions + poses.rotations @ EMITTER
     back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, EARS)
     first = np.where(np.isfinite(first), first, np.nan)
-    return predict((out[:, None] + back) / 2, back - out[:, None], first)
+    return predict_ranges((out[:, None] + back) / 2, back - out[:, None], first)
 
 
 def test_a_sphere_is_found_with_centre_and_size():
@@ -283,7 +283,7 @@ def test_levels_noise_and_echoes_are_counted():
     assert loud.level_db == pytest.approx(0.0, abs=0.01)
     assert faint.level_db == pytest.approx(-10.0, abs=0.05)
     assert loud.noise_db == pytest.approx(-42.0, abs=1.5)
-    assert (loud.heard, faint.heard, loud.asked) == (30, 30, 30)
+    assert (loud.heard, faint.heard, loud.checked) == (30, 30, 30)
     assert faults_of_channels([loud, faint]) == []
 
 

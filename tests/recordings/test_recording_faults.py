@@ -18,8 +18,8 @@ import pytest
 from scipy.io import wavfile
 
 from sononerf.errors import SonoNerfError
-from sononerf.run.import_recordings import check_before, describe, import_understood
-from sononerf.run.understand import understand
+from sononerf.run.import_plan import plan_import
+from sononerf.run.import_recordings import check_before, describe_plan, write_import
 from tests.recordings.two_spheres import RATE, SAMPLES, write_folder, write_long
 
 PINGS = 48
@@ -283,8 +283,8 @@ def said_of(folder, output, caplog):
     """Return what an import says, and how long it takes, s."""
     begun = time.monotonic()
     with caplog.at_level(logging.WARNING, "sononerf"):
-        known = understand("recordings", folder, output)
-        lines = [line for line in describe(known) if line.startswith("warning")]
+        known = plan_import("recordings", folder, output)
+        lines = [line for line in describe_plan(known) if line.startswith("warning")]
         lines += [check_before(known).message]
     lines += [record.getMessage() for record in caplog.records]
     return "\n".join(lines).strip(), time.monotonic() - begun
@@ -301,7 +301,7 @@ def test_a_fault_is_refused_with_one_line_and_leaves_nothing(name, folder, tmp_p
     store = tmp_path / "store"
     begun = time.monotonic()
     with pytest.raises(SonoNerfError, match=words) as caught:
-        import_understood(understand("recordings", folder, store), store)
+        write_import(plan_import("recordings", folder, store), store)
     assert time.monotonic() - begun < 10.0
     assert "\n" not in str(caught.value)
     assert not store.exists() or not any(store.iterdir())

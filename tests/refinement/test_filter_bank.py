@@ -8,7 +8,7 @@ from scipy.fft import next_fast_len
 from torch.autograd import forward_ad
 
 from sononerf.head.call import emit
-from sononerf.head.front_end import range_axis, spectrogram
+from sononerf.head.front_end import dechirped_spectrogram, range_axis
 from sononerf.head.head import Head
 from sononerf.refinement.filter_bank import Arrivals, FilterBank, fast_length
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
@@ -18,9 +18,9 @@ SOFT = 25e3
 
 
 def bank_of(kind, harmonics=(1.0,), analysis_kind="stft", **changes):
-    analysis = SpectrogramSettings(range_min=0.2, range_max=0.5, kind=analysis_kind, **changes)
+    spectrogram = SpectrogramSettings(range_min=0.2, range_max=0.5, kind=analysis_kind, **changes)
     call = CallSettings(kind=kind, harmonics=harmonics, frequency_end=40e3 / len(harmonics))
-    reception = Head(call=call, analysis=analysis)
+    reception = Head(call=call, spectrogram=spectrogram)
     return FilterBank(reception, NODES, SOFT), reception
 
 
@@ -45,18 +45,18 @@ def power(bank, strength, at, frames, receiver=0, receivers=1):
 )
 def test_rows_are_those_of_the_analysis_for_any_call(kind, changes):
     bank, reception = bank_of(kind, **changes)
-    analysis = reception.analysis
+    spectrogram = reception.spectrogram
     place, first = 1703.3, 1280
-    top = 150e3 if analysis.kind == "stft" else 200e3  # a gammatone's skirts reach farther
+    top = 150e3 if spectrogram.kind == "stft" else 200e3  # a gammatone's skirts reach farther
     length = next_fast_len(reception.samples)
-    frequency = np.fft.rfftfreq(length, 1 / analysis.sampling_rate)
+    frequency = np.fft.rfftfreq(length, 1 / spectrogram.sampling_rate)
     level = 1j * frequency + np.hypot(frequency, SOFT)
-    level *= np.exp(-2j * np.pi * frequency * place / analysis.sampling_rate) * (frequency < top)
+    level *= np.exp(-2j * np.pi * frequency * place / spectrogram.sampling_rate) * (frequency < top)
     echo = emit(np.fft.irfft(level, n=length)[None], reception.waveform)[:, : reception.samples]
-    wanted = spectrogram(echo, analysis, 343.0, reception.delay)[0]
+    wanted = dechirped_spectrogram(echo, spectrogram, 343.0, reception.delay)[0]
     found = power(bank, torch.ones(1), torch.tensor([place - first]), 512)[0].sqrt().numpy()
-    start = range_axis(analysis, 343.0)[0] * 2.0 * analysis.sampling_rate / 343.0
-    row = round((first - start + bank.filters.centre) / analysis.hop)
+    start = range_axis(spectrogram, 343.0)[0] * 2.0 * spectrogram.sampling_rate / 343.0
+    row = round((first - start + bank.filters.centre) / spectrogram.hop)
     part = wanted[row + 20 : row + 200]
     loud = part > 0.1 * part.max()
     error = 20 * np.log10(found[20:200][loud] / part[loud])
@@ -67,7 +67,7 @@ def test_rows_are_those_of_the_analysis_for_any_call(kind, changes):
 
 def test_what_comes_a_frame_later_is_heard_a_frame_later():
     bank, reception = bank_of("impulse")
-    times = torch.tensor([300.0, 300.0 + reception.analysis.hop])
+    times = torch.tensor([300.0, 300.0 + reception.spectrogram.hop])
     early, late = (power(bank, torch.ones(1), at[None], 256)[0] for at in times)
     assert torch.allclose(early[:-1], late[1:], rtol=1e-3, atol=1e-4 * float(early.max()))
 

@@ -12,8 +12,8 @@ import trimesh
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.refinement.objective import (
-    SCALE,
-    Level,
+    HUBER_SCALE,
+    ErrorLevel,
     OnsetRanges,
     differences,
     measured,
@@ -37,7 +37,7 @@ def example(gain=1.0, poses=3):
 
 def test_what_is_rendered_as_measured_has_no_mismatch():
     heard, echoes = example()
-    level = Level(2, 4, heard.power)
+    level = ErrorLevel(2, 4, heard.power)
     errors = mismatch(
         *differences(heard, None, measured(echoes, [0, 1, 2], heard), level, learn=False)
     )
@@ -46,7 +46,7 @@ def test_what_is_rendered_as_measured_has_no_mismatch():
 
 def test_a_gain_is_learned():
     heard, echoes = example(gain=2.0)
-    level = Level(2, 4, heard.power)
+    level = ErrorLevel(2, 4, heard.power)
     found = measured(echoes, [0, 1, 2], heard)
     before = float(mismatch(*differences(heard, None, found, level, learn=False)).mean())
     for _ in range(60):
@@ -58,7 +58,7 @@ def test_a_gain_is_learned():
 
 def test_later_bounces_add_power():
     heard, echoes = example(gain=np.sqrt(2.0))
-    level = Level(2, 4, heard.power)
+    level = ErrorLevel(2, 4, heard.power)
     found = measured(echoes, [0, 1, 2], heard)
     errors = mismatch(*differences(heard, heard.power.clone(), found, level, learn=False))
     assert float(errors.max()) < 1e-3
@@ -69,7 +69,7 @@ def test_frequencies_that_are_always_wrong_count_less():
     found = measured(echoes, [0, 1, 2], heard)
     magnitude = found[0].clone()
     magnitude[..., 0] *= 0.2
-    level = Level(2, 4, heard.power)
+    level = ErrorLevel(2, 4, heard.power)
     level.gain[:] = 0.0
     for _ in range(60):
         differences(heard, None, (magnitude, *found[1:]), level, learn=True)
@@ -88,7 +88,7 @@ def test_rows_beyond_the_axis_do_not_count():
 
 def test_a_level_is_taken_over_whole():
     heard, echoes = example(gain=1.5)
-    level, other = Level(2, 4, heard.power), Level(2, 4, heard.power)
+    level, other = ErrorLevel(2, 4, heard.power), ErrorLevel(2, 4, heard.power)
     differences(heard, None, measured(echoes, [0, 1, 2], heard), level, learn=True)
     other.load(level.state())
     assert torch.equal(level.gain, other.gain)
@@ -122,7 +122,7 @@ def box():
 def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
     onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
     assert onsets.misfit(vertices_of(box)) == pytest.approx(0.0, abs=1e-9)
-    off = 2.0 * SCALE * RESOLUTION
+    off = 2.0 * HUBER_SCALE * RESOLUTION
     smaller = box.copy()
     smaller.vertices *= 1 - off / 0.04
     assert 0.5 < onsets.misfit(vertices_of(smaller)) < 2.5
@@ -130,7 +130,7 @@ def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
 
 def test_onsets_may_all_come_late_but_not_early(box):
     onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
-    off = 2.0 * SCALE * RESOLUTION
+    off = 2.0 * HUBER_SCALE * RESOLUTION
     larger, smaller = (box.copy().apply_scale(1 + side * off / 0.03) for side in (1, -1))
     before = onsets.misfit(vertices_of(larger))
     assert onsets.misfit(vertices_of(larger), late=2 * off) < 0.3 * before

@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from sononerf.refinement.descent import Sides
-from sononerf.refinement.objective import Level, differences, measured, mismatch
+from sononerf.refinement.objective import ErrorLevel, differences, measured, mismatch
 from sononerf.refinement.plane_descent import PlaneDescent, flattest
 from sononerf.refinement.planes import flat_parts, motions, on_patches, patches_of, planes_of
 from sononerf.refinement.remesh import distance_from
@@ -199,7 +199,7 @@ def fine(box, optics):
 
 
 def descent(mesh, echoes, optics, band=1.0):
-    level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+    level = ErrorLevel(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
     level.learns = "none"
     return PlaneDescent(mesh, echoes, optics, level, rate=0.08, band=band, seed=0)
 

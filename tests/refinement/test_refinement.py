@@ -17,7 +17,7 @@ from sononerf.refinement import objective as objectives_module
 from sononerf.refinement import refine as module
 from sononerf.refinement.candidates import Candidate, best_of, planned
 from sononerf.refinement.descent import Descent, Stage, poses_that_hear
-from sononerf.refinement.objective import Level, OnsetRanges
+from sononerf.refinement.objective import ErrorLevel, OnsetRanges
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement
 from sononerf.refinement.remesh import distance_from, remesh
@@ -88,7 +88,7 @@ def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
     assert found.kept
     assert len(found.confidence) == len(found.mesh.vertices)
     assert found.gain.shape == (2, len(optics.frequencies))
-    assert [(one["stage"], one["way"]) for one in found.history][:2] == [
+    assert [(one["stage"], one["schedule"]) for one in found.history][:2] == [
         (0, "blurred"),
         (0, "sharp"),
     ]
@@ -104,7 +104,7 @@ def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, opti
     half = bumpy.copy().apply_scale(0.5)
     for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
         work = begun(starts, echoes, optics)
-        assert [(one.start, one.way) for one in work.candidates] == [
+        assert [(one.start, one.schedule) for one in work.candidates] == [
             ("whole", "blurred"),
             ("whole", "sharp"),
         ]
@@ -170,7 +170,11 @@ def test_saved_stages_are_not_repeated_and_the_end_is_the_same(
     given = simulated_stage if corrected else {}
     saved, ends = {}, {}
     whole = refined(bumpy, echoes, optics, saved=saved, **given)
-    assert list(saved) == ["body-blurred-0", "body-sharp-0", f"body-{whole.history[-1]['way']}-1"]
+    assert list(saved) == [
+        "body-blurred-0",
+        "body-sharp-0",
+        f"body-{whole.history[-1]['schedule']}-1",
+    ]
     for kept in range(4):  # a kill after each stage
         some = dict(list(saved.items())[:kept])
         steps = []
@@ -188,14 +192,14 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
 ):
     factor = 3.0
     old = hearing_of(optics.head)
-    analysis = settings.spectrogram
-    slow = analysis.model_copy(
+    original = settings.spectrogram
+    slow = original.model_copy(
         update={
-            "sampling_rate": analysis.sampling_rate / factor,
-            "frequency_min": analysis.frequency_min / factor,
-            "frequency_max": analysis.frequency_max / factor,
-            "range_min": analysis.range_min * factor,
-            "range_max": analysis.range_max * factor,
+            "sampling_rate": original.sampling_rate / factor,
+            "frequency_min": original.frequency_min / factor,
+            "frequency_max": original.frequency_max / factor,
+            "range_min": original.range_min * factor,
+            "range_max": original.range_max * factor,
         }
     )
 
@@ -215,22 +219,22 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
         def absorption(self, frequency):
             return np.zeros(len(frequency))
 
-    def optics_at(scale, spectrogram):
-        head = Scaled(ears=settings.ears, analysis=spectrogram)
-        head.__dict__.update(scale=scale, window=np.zeros((1, analysis.window)))
+    def optics_at(scale, front_end):
+        head = Scaled(ears=settings.ears, spectrogram=front_end)
+        head.__dict__.update(scale=scale, window=np.zeros((1, original.window)))
         synthesis = dataclasses.replace(old.synthesis, nodes=old.synthesis.nodes / scale)
         return Optics(head, Hearing(head, synthesis))
 
-    def moved(scale, spectrogram):
+    def moved(scale, front_end):
         world = changed(
             echoes,
             positions=echoes.positions * scale,
             read=lambda number: echoes.store.read_pose(number) / np.float32(scale),
         )
-        heard = optics_at(scale, spectrogram)
+        heard = optics_at(scale, front_end)
         mesh = trimesh.Trimesh(bumpy.vertices * scale, bumpy.faces, process=False)
         made = module.remesh(mesh, 0.8 * heard.wavelength, 0.3 * heard.wavelength)
-        level = Level(heard.ears, len(heard.frequencies), heard.get_buffer("wavenumber"))
+        level = ErrorLevel(heard.ears, len(heard.frequencies), heard.get_buffer("wavenumber"))
         work = Descent(
             made, world, heard, level, smoothing=1.5 * heard.wavelength, rate=0.02, seed=0
         )
@@ -238,7 +242,7 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
             work.step(step, step / 4)
         return work.vertices / scale
 
-    one, three = moved(1.0, analysis), moved(factor, slow)
+    one, three = moved(1.0, original), moved(factor, slow)
     assert one.shape == three.shape
     assert float((one - three).abs().max()) < 2e-3 * optics.wavelength
 
@@ -312,7 +316,7 @@ def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box
     worn = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(1.02), iterations=3)
     saved = {}
     found = refined({"levels": worn}, box_echoes, optics, saved=saved)
-    assert [(one["stage"], one["way"]) for one in found.history] == [
+    assert [(one["stage"], one["schedule"]) for one in found.history] == [
         (0, "planes"),
         (0, "sharp"),
         (1, "planes"),
@@ -336,14 +340,14 @@ def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_
     first = work.candidates[0]
     np.testing.assert_array_equal(first.meshes[0].vertices, fuller.vertices)
     work.first_stage()
-    assert (first.way, first.start) == ("planes", "levels")
+    assert (first.schedule, first.start) == ("planes", "levels")
     np.testing.assert_array_equal(first.meshes[0].vertices, levels.vertices)
     assert first.objectives[0] == work.compared["levels"]
 
 
 def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
     work = begun({"levels": bumpy}, echoes, optics)
-    assert [one.way for one in work.candidates] == ["blurred", "sharp"]
+    assert [one.schedule for one in work.candidates] == ["blurred", "sharp"]
 
 
 @pytest.mark.slow
@@ -425,7 +429,7 @@ def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
         for _ in range(2):  # the second time the stages are saved
             work = preset(
                 begun(starts, echoes, optics, saved=saved),
-                lambda mesh, one, number, v=value: v if one and one.way == "sheet" else 1.0,
+                lambda mesh, one, number, v=value: v if one and one.schedule == "sheet" else 1.0,
             )
             work.first_stage()
             (candidate,) = work.candidates
@@ -437,7 +441,7 @@ def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
 def test_a_sheet_alone_is_refined(echoes, optics):
     found = refined({"sheet": slab(2e-4)}, echoes, optics)
     assert found.start == "sheet"
-    assert {one["way"] for one in found.history} == {"sheet"}
+    assert {one["schedule"] for one in found.history} == {"sheet"}
 
 
 @pytest.fixture(scope="module")
@@ -446,7 +450,7 @@ def too_large():
 
 
 def descent_on(mesh, echoes, optics):
-    level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+    level = ErrorLevel(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
     level.learns = "none"
     smoothing = 1.5 * optics.wavelength
     return Descent(mesh, echoes, optics, level, smoothing=smoothing, rate=0.02, seed=0)
@@ -489,7 +493,7 @@ def test_onsets_move_the_surface_to_where_it_must_begin(echoes, optics):
     )
     sizes = []
     for known in (None, onsets):
-        level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+        level = ErrorLevel(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
         work = Descent(
             ball, echoes, optics, level, smoothing=0.004, rate=0.02, onsets=known, seed=0
         )

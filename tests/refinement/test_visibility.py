@@ -8,9 +8,9 @@ import trimesh
 
 from sononerf.geometry.raycast import Occlusion
 from sononerf.refinement.descent import Descent
-from sononerf.refinement.objective import Level, differences, measured, mismatch
+from sononerf.refinement.objective import ErrorLevel, differences, measured, mismatch
 from sononerf.refinement.remesh import remesh
-from sononerf.refinement.tracer import FREE, Correction, StillSurface, Tracer, seen
+from sononerf.refinement.tracer import FREE_DISTANCE, Correction, StillSurface, Tracer, seen
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene
 from tests.memory import changed
@@ -48,7 +48,7 @@ def test_the_other_side_of_a_sheet_pushed_through_hides_nothing(optics):
         sheet = sheet.subdivide()
     vertices = np.array(sheet.vertices)
     front = vertices[:, 0] > 0
-    vertices[front, 0] -= FREE * optics.wavelength  # now behind the other side
+    vertices[front, 0] -= FREE_DISTANCE * optics.wavelength  # now behind the other side
     crossed = trimesh.Trimesh(vertices, sheet.faces, process=False)
     places, _ = heard(optics, crossed, [0.3, 0.0, 0.0])
     assert len(places) > 50
@@ -124,7 +124,7 @@ def correction(optics, sphere, simulator, echoes):
 
 @pytest.fixture
 def level(optics):
-    found = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+    found = ErrorLevel(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
     found.learns = "none"
     return found
 

@@ -21,7 +21,7 @@ from sononerf.field.module import EchoModule
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.refinement.objective import SCALE
+from sononerf.refinement.objective import HUBER_SCALE
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement
 from sononerf.run.build import head_of, module_for, read_truth, true_mesh, with_store
@@ -149,7 +149,7 @@ def test_renderer_and_refinement_have_the_range_resolution_of_the_head(config):
         simulate=lambda mesh: None,
         seed=0,
     )
-    assert work.onsets.scale == SCALE * head.resolution
+    assert work.onsets.scale == HUBER_SCALE * head.resolution
     assert ProfileRenderer(BOX, head, surroundings=1.0).surroundings == head.resolution
 
 
@@ -255,8 +255,8 @@ def test_an_unfinished_or_silent_store_is_refused(alone, echoes, tmp_path):
     bare = tmp_path / "bare"
     store = EnsembleStore.create(
         bare,
-        poses_positions=np.zeros((1, 3)),
-        poses_rotations=np.eye(3)[None],
+        positions=np.zeros((1, 3)),
+        rotations=np.eye(3)[None],
         split=[0],
         range=[0.1, 0.2],
         frequency=[1e4],

@@ -16,7 +16,7 @@ from sononerf.head.front_end import range_axis
 from sononerf.refinement.self_calibration import Calibration, Estimate
 from sononerf.run import calibrate as module
 from sononerf.run.build import with_store
-from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of, moved
+from sononerf.run.calibrate import calibrate, dependent_cells, describe_estimate, kinds_of, moved
 from sononerf.run.run import Run
 from sononerf.settings.schema import SpectrogramSettings
 
@@ -26,7 +26,7 @@ SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 @pytest.fixture
 def run(fitted_run, tmp_path, monkeypatch):
     """A run whose surface is the true one."""
-    monkeypatch.setattr(module, "STEPS", 3)
+    monkeypatch.setattr(module, "MAX_STEPS", 3)
     path = tmp_path / "run"
     shutil.copytree(fitted_run, path)
     (path / "reconstruction").mkdir(exist_ok=True)
@@ -60,9 +60,9 @@ def test_the_speed_of_sound_changes_the_ranges(run, tmp_path):
     store = Run(run).echoes.store
     ratio = found.store.attributes["speed_of_sound"] / store.attributes["speed_of_sound"]
     np.testing.assert_allclose(found.store.range, np.asarray(store.range) * ratio, rtol=1e-6)
-    analysis = SpectrogramSettings(**found.store.attributes["settings"]["spectrogram"])
+    spectrogram = SpectrogramSettings(**found.store.attributes["settings"]["spectrogram"])
     speed = found.store.attributes["speed_of_sound"]
-    np.testing.assert_allclose(range_axis(analysis, speed), found.store.range, rtol=1e-6)
+    np.testing.assert_allclose(range_axis(spectrogram, speed), found.store.range, rtol=1e-6)
     assert any("one distance" in line for line in found.warnings)
     assert EnsembleStore.open(tmp_path / "corrected").attributes["settings"]["air"][
         "speed_of_sound"
@@ -78,7 +78,7 @@ def test_what_is_not_determined_is_said(run):
         {"gain": 0.5, "range_offset": 0.01, "speed_of_sound": 0.1},
         [3.0, 2.9],
     )
-    _, warnings = describe(fitted.head, store, SPHERE, estimate, kinds)
+    _, warnings = describe_estimate(fitted.head, store, SPHERE, estimate, kinds)
     text = "\n".join(warnings)
     for words in (
         "gain: the echoes do not determine it",
@@ -99,7 +99,7 @@ def test_a_turntable_hardly_tells_a_range_offset(run):
     )
     estimate = Estimate(Calibration(np.zeros((2, 3))), {"range_offset": 1e-4}, [])
     for poses, warned in ((store, False), (turned, True)):
-        _, warnings = describe(fitted.head, poses, SPHERE, estimate, ("range_offset",))
+        _, warnings = describe_estimate(fitted.head, poses, SPHERE, estimate, ("range_offset",))
         assert any("those of a turntable" in line for line in warnings) == warned
 
 

@@ -40,7 +40,7 @@ from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
-from sononerf.run.fit import LINE, fit, fit_warnings, peak_memory_bytes
+from sononerf.run.fit import LINE_WARNING, fit, fit_warnings, peak_memory_bytes
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import STAGES, Run
@@ -358,7 +358,7 @@ def test_repeated_poses_on_a_line_are_told(heard):
     rows = [0, 0, 0, 0, 1]
     told = fit_warnings(copied(heard, heard.poses()[rows], rows), BODY, is_set=False)
     assert told[0].startswith("only 2 of 5 training poses differ")
-    assert LINE in told
+    assert LINE_WARNING in told
 
 
 def test_poses_that_look_away_are_told(heard):

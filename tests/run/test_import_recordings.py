@@ -15,8 +15,8 @@ from sononerf.errors import (
     NumericalError,
     SettingsError,
 )
-from sononerf.run.import_recordings import check_before, describe, draw, import_understood
-from sononerf.run.understand import understand
+from sononerf.run.import_plan import plan_import
+from sononerf.run.import_recordings import check_before, describe_plan, draw_plan, write_import
 from sononerf.storage import lock
 from tests.recordings.recorded import SETTINGS, TARGET, arrays, waveforms
 
@@ -30,8 +30,8 @@ def brought(tmp_path):
     def run(*overrides, output="store", **changes):
         np.savez(tmp_path / "a.npz", **arrays(**changes))
         source, target = tmp_path / "a.npz", tmp_path / output
-        known = understand("numpy", source, target, overrides=[*GIVEN, *overrides])
-        return import_understood(known, target)
+        known = plan_import("numpy", source, target, overrides=[*GIVEN, *overrides])
+        return write_import(known, target)
 
     return run
 
@@ -165,7 +165,7 @@ def test_what_is_bad_leaves_nothing_behind(brought, tmp_path):
 def test_poses_are_checked_without_a_store(tmp_path):
     np.savez(tmp_path / "a.npz", **arrays(**mirrored()))
     given = [*GIVEN, "call={kind: impulse}"]
-    known = understand("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=given)
+    known = plan_import("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=given)
     assert check_before(known).name == "left-handed frame"
     assert not (tmp_path / "s").exists()
 
@@ -177,8 +177,8 @@ def test_a_store_in_use_is_not_touched(brought, tmp_path):
 
 def test_what_was_understood_is_said_and_drawn(tmp_path):
     np.savez(tmp_path / "a.npz", **arrays())
-    known = understand("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=GIVEN)
-    text = "\n".join(describe(known))
+    known = plan_import("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=GIVEN)
+    text = "\n".join(describe_plan(known))
     for words in (
         "a.npz (numpy), 250000 Hz",
         "24 read, 6.4 ms each, 0 clipped and rejected; 21 train, 1 validation, 2 test",
@@ -192,11 +192,11 @@ def test_what_was_understood_is_said_and_drawn(tmp_path):
         "import.compress=true resolves them to",
     ):
         assert words in text
-    known = understand(
+    known = plan_import(
         "numpy", tmp_path / "a.npz", tmp_path / "s", overrides=[*GIVEN, "import.compress=true"]
     )
-    text = "\n".join(describe(known))
+    text = "\n".join(describe_plan(known))
     assert "impulse, by pulse compression" in text
     assert "import.compress=true" not in text
-    assert draw(known, tmp_path / "p").read_bytes().startswith(b"\x89PNG")
+    assert draw_plan(known, tmp_path / "p").read_bytes().startswith(b"\x89PNG")
     assert not (tmp_path / "s").exists()

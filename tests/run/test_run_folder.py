@@ -155,7 +155,7 @@ def test_the_machine_of_the_tests_can_do_all(tmp_path):
     found = by_name(examine(tmp_path))
     assert {"python", "cpu", "memory", "torch", "gpu", "ray casting", "disk"} < set(found)
     assert all(finding.good for finding in found.values())
-    assert found["disk"].found.endswith("writes and locks work")
+    assert found["disk"].value.endswith("writes and locks work")
     assert not list(tmp_path.iterdir())
     plain = json.loads(json.dumps(as_plain(list(found.values()))))
     assert plain["good"] is True

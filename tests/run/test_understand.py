@@ -11,8 +11,8 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.head.call import call_waveform
 from sononerf.recordings.recording import wav_bytes
 from sononerf.run.build import with_store
-from sononerf.run.import_recordings import echo_hash, import_understood, spectrogram_of
-from sononerf.run.understand import understand
+from sononerf.run.import_plan import plan_import
+from sononerf.run.import_recordings import import_hash, spectrogram_of, write_import
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import CallSettings
 from tests.recordings.recorded import CALL, EARS, RATE, SETTINGS, arrays, waveforms
@@ -24,7 +24,7 @@ def recorded(tmp_path):
 
     def read(*overrides, settings=SETTINGS, settings_file=None, **changes):
         np.savez(tmp_path / "a.npz", **arrays(**changes))
-        return understand(
+        return plan_import(
             "numpy",
             tmp_path / "a.npz",
             tmp_path / "store",
@@ -37,13 +37,13 @@ def recorded(tmp_path):
 
 def test_the_rate_and_the_band_come_from_recording_and_call(recorded):
     found = recorded(settings=SETTINGS[:2])
-    analysis = found.settings.spectrogram
-    assert (analysis.sampling_rate, analysis.frequency_min, analysis.frequency_max) == (
+    spectrogram = found.settings.spectrogram
+    assert (spectrogram.sampling_rate, spectrogram.frequency_min, spectrogram.frequency_max) == (
         RATE,
         20e3,
         80e3,
     )
-    assert (analysis.window, analysis.hop, analysis.fft) == (16, 1, 128)
+    assert (spectrogram.window, spectrogram.hop, spectrogram.fft) == (16, 1, 128)
     assert found.head.speed_of_sound == 343.0
 
 
@@ -73,7 +73,7 @@ def test_files_of_the_settings_lie_beside_them(recorded, tmp_path):
     (tmp_path / "import.yaml").write_text("call: {kind: file, file: call.wav}\n")
     found = recorded(settings=(SETTINGS[0], *SETTINGS[2:]))
     assert found.settings.call.file == tmp_path / "call.wav"
-    import_understood(found, tmp_path / "store")
+    write_import(found, tmp_path / "store")
     (tmp_path / "call.wav").unlink()
     known = with_store(validate_settings({"data": {"store": str(tmp_path / "store")}}, "test"))
     assert known.call.file.parent == tmp_path / "store" / "attached"
@@ -129,7 +129,7 @@ def test_wrong_calls_are_told(tmp_path):
         ("numpy", ".", InputError, "is a folder; the format numpy is one file"),
     ):
         with pytest.raises(error, match=words):
-            understand(form, tmp_path / source, tmp_path / "store")
+            plan_import(form, tmp_path / source, tmp_path / "store")
 
 
 def test_all_clipped_or_nan_or_short_is_told(recorded):
@@ -158,4 +158,4 @@ def test_pulse_compression_gives_echoes_of_an_impulse(recorded):
         for power in (np.square(spectrogram_of(each, 3)[0]).mean(axis=1) for each in (plain, found))
     )
     assert narrow < 0.6 * wide
-    assert echo_hash(plain) != echo_hash(found)
+    assert import_hash(plain) != import_hash(found)

@@ -29,7 +29,7 @@ class OpenHead(Head):
     """A head whose gains are 1 everywhere."""
 
     def __init__(self, emitter, ears, absorption):
-        super().__init__(analysis=ANALYSIS)
+        super().__init__(spectrogram=ANALYSIS)
         self.__dict__.update(
             emitter=np.array(emitter, dtype=float),
             receivers=np.array(ears, dtype=float),

@@ -14,7 +14,7 @@ import trimesh
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.run.build import simulator_of
-from sononerf.scene.scene import Scene, check_aim, check_poses, check_reach, load_scene
+from sononerf.scene.scene import Scene, check_aim, check_positions, check_reach, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation.ensemble import simulate_ensemble
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
@@ -150,7 +150,7 @@ def test_poses_are_checked_fast_in_a_million_triangles():
     places[7] *= 1.2  # outside, and within the box
     started = time.process_time()
     with pytest.raises(InputError, match=r"429 of 430 poses \(0, 1, 2, 3, 4, 5, 6, 8, 9, 10,"):
-        check_poses(scene, poses_at(*places), offsets=np.eye(3) * 0.01)
+        check_positions(scene, poses_at(*places), offsets=np.eye(3) * 0.01)
     assert time.process_time() - started < 20.0  # a look at every triangle for each takes minutes
 
 
@@ -301,21 +301,21 @@ def test_poses_inside_are_refused_even_where_bodies_overlap():
     one, two = (trimesh.creation.icosphere(subdivisions=3, radius=0.1) for _ in range(2))
     two.apply_translation([0.1, 0.0, 0.0])
     scene = Scene(trimesh.util.concatenate([one, two]))
-    check_poses(scene, poses_at([0.0, 0.0, 0.101], [-0.09, 0.09, 0.0], [0.3, 0.0, 0.0]))
+    check_positions(scene, poses_at([0.0, 0.0, 0.101], [-0.09, 0.09, 0.0], [0.3, 0.0, 0.0]))
     with pytest.raises(InputError, match=r"3 of 4 poses \(0, 1, 3\) are inside"):
         # the second lies in both bodies, which a count of crossings takes for outside
-        check_poses(scene, poses_at([-0.05, 0, 0], [0.05, 0, 0], [0, 0, 0.2], [0.15, 0, 0]))
+        check_positions(scene, poses_at([-0.05, 0, 0], [0.05, 0, 0], [0, 0, 0.2], [0.15, 0, 0]))
     inverted = Scene(trimesh.Trimesh(one.vertices, one.faces[:, ::-1]))
     with pytest.raises(InputError, match="inside"):
-        check_poses(inverted, poses_at([0.0, 0.0, 0.05]))
+        check_positions(inverted, poses_at([0.0, 0.0, 0.05]))
 
 
 def test_ears_inside_are_refused():
     scene = load_scene("sphere", {"radius": 0.1})
     outside = Poses(np.array([[0.105, 0.0, 0.0]]), np.eye(3)[None])
-    check_poses(scene, outside, offsets=np.array([[0.01, 0.0, 0.0]]))
+    check_positions(scene, outside, offsets=np.array([[0.01, 0.0, 0.0]]))
     with pytest.raises(InputError, match="inside"):
-        check_poses(scene, outside, offsets=np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
+        check_positions(scene, outside, offsets=np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
 
 
 def test_poses_that_look_away_or_are_all_the_same_are_told(caplog):

@@ -22,7 +22,7 @@ POINT = POSITION + ROTATION @ np.array([[0.3, 0.05, -0.1]])[0]
 
 
 def hearing(absorption=0.0):
-    head = Absorbing(ears=SETTINGS, analysis=ANALYSIS)
+    head = Absorbing(ears=SETTINGS, spectrogram=ANALYSIS)
     head.__dict__["loss"] = absorption
     return Hearing(head, SYNTHESIS)
 

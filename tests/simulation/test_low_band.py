@@ -231,7 +231,7 @@ def settled(wanted, progress=QUIET):
 
 @pytest.fixture
 def few(monkeypatch):
-    monkeypatch.setattr(module, "FIRST", 500)
+    monkeypatch.setattr(module, "FIRST_RAYS", 500)
 
 
 @pytest.mark.slow

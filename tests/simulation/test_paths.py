@@ -34,7 +34,7 @@ def detour(bounce, listener):
     """Detour, spread and stiffness (H,) towards a place."""
     away = listener - bounce.points
     distance = np.linalg.norm(away, axis=1)
-    ways = bounce.ways_to(listener)
+    ways = bounce.paths_to(listener)
     np.testing.assert_allclose(ways.distance, distance)
     for found, axis in ((ways.rise, bounce.flat), (ways.cosine, bounce.mirrored)):
         np.testing.assert_allclose(found, np.einsum("nd,nd->n", away, axis) / distance, atol=1e-6)

@@ -13,7 +13,7 @@ from sononerf.run.build import simulator_of
 from sononerf.scene.material import RIGID, Material
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import EarSettings
-from sononerf.simulation.footprint import Footprint, emit, land, onto
+from sononerf.simulation.footprint import Footprint, emit_bundles, land, onto
 from sononerf.simulation.hearing import Arrival, Hearing, silence_before
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import (
@@ -317,7 +317,7 @@ def test_bundles_are_turned_about_two_vectors_square_to_any_direction():
     """Also to those along the axes, where other frames break down."""
     axes = np.concatenate([np.eye(3), -np.eye(3), [[1e-9, 0, -1]], fibonacci_sphere(200)])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    bundles = emit(axes, np.full(len(axes), 0.5))
+    bundles = emit_bundles(axes, np.full(len(axes), 0.5))
     turn = bundles[:, 6:]
     np.testing.assert_allclose(bundles[:, :6], 0.5 * turn)
     np.testing.assert_allclose(products(turn, turn), [[1, 1, 0]] * len(axes), atol=1e-6)
@@ -329,7 +329,7 @@ def plane(slope, side=1.0):
     """A bundle 0.5 m from the emitter that falls on a plate under an angle of incidence."""
     incoming = np.array([[1.0, 0.0, 0.0]])
     normal = np.array([[-np.cos(slope), np.sin(slope), 0.0]])
-    bundles = emit(incoming, np.array([0.5]))
+    bundles = emit_bundles(incoming, np.array([0.5]))
     rows, *others = land(bundles, incoming, side * normal, side * normal, NO_BEND)
     return Footprint(rows), *others
 

@@ -262,10 +262,10 @@ def test_glints_are_those_of_physical_optics(body):
 def test_echoes_are_those_of_the_wave_equation(name, low, high, most):
     """Mean error over the cells within 20 dB of the loudest of their pose, dB."""
     small = name != "three_spheres"
-    analysis = SMALL if small else {"frequency_max": 80e3}
+    spectrogram = SMALL if small else {"frequency_max": 80e3}
     case, found = (
         Case.load(name),
-        simulator(scene_of(name), 60_000, spectrogram=analysis, simulation={"sources": 1000}),
+        simulator(scene_of(name), 60_000, spectrogram=spectrogram, simulation={"sources": 1000}),
     )
     truth = case.spectrograms(found.head)
     magnitude = heard(found, case, band=banded if small else None)

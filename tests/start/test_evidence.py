@@ -12,9 +12,9 @@ from sononerf.start.evidence import (
     AT_ONSET,
     COMPRESSION,
     Evidence,
+    fitted_distance,
     locate_sound,
     reliability,
-    signed_distance,
 )
 from sononerf.start.occupancy import clearance_grid
 
@@ -164,7 +164,7 @@ NONE = np.zeros((SIZE,) * 3, np.float32)
 def solve(weight=NONE, target=NONE, bound=None, pull=1e-3, empty=NONE):
     if bound is None:
         bound = AWAY - 14
-    return signed_distance(weight, target, bound, pull, empty, 1.0)
+    return fitted_distance(weight, target, bound, pull, empty, 1.0)
 
 
 def test_without_evidence_the_body_reaches_as_far_as_it_may():

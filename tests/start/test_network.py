@@ -29,7 +29,7 @@ from sononerf.start.features import (
 )
 from sononerf.start.network import (
     FRAMES,
-    FULLER,
+    FULLER_DISTANCE,
     LOGIT,
     VOXEL,
     StartNetwork,
@@ -112,7 +112,7 @@ def test_the_fuller_surface_lies_outside():
     middle, radius = np.array(BALLS[0][:3]), BALLS[0][3]
     far = [np.linalg.norm(found.vertices - middle, axis=1) for found in (one, fuller)]
     thin, thick = (np.median(of[of < 1.2 * radius]) for of in far)
-    assert thick - thin == pytest.approx(FULLER * VOXEL * RESOLUTION, rel=0.3)
+    assert thick - thin == pytest.approx(FULLER_DISTANCE * VOXEL * RESOLUTION, rel=0.3)
 
 
 def test_a_turned_scene_gives_a_turned_surface():
@@ -237,7 +237,7 @@ def test_a_frame_is_the_lattice_turned(frame):
     lattice = lattice_of(hull, np.array([[-0.04] * 3, [0.04] * 3]), RESOLUTION)
     none = np.zeros([size // 2 for size in lattice.shape], bool)
     places = features_of(levels, np.arange(50), hull, lattice, none)
-    seen, bound = places.turned(order, signs)
+    seen, bound = places.in_frame(order, signs)
     assert seen.shape == (FEATURES, *bound.shape)
     balls = tuple((*(turn @ ball[:3]), ball[3]) for ball in BALLS)
     levels, hull = heard(sources @ turn.T, balls)
@@ -247,7 +247,7 @@ def test_a_frame_is_the_lattice_turned(frame):
         (corners @ turn.T).min(axis=0), lattice.spacing, tuple(lattice.shape[k] for k in order)
     )
     places = features_of(levels, np.arange(50), hull, other, none.transpose(order))
-    expected, expected_bound = places.turned(*FRAMES[0])
+    expected, expected_bound = places.in_frame(*FRAMES[0])
     np.testing.assert_allclose(seen, expected, atol=2e-3)
     np.testing.assert_allclose(bound, expected_bound, atol=1e-3)
 
@@ -267,7 +267,7 @@ def test_in_free_space_every_second_place_stands_for_those_beside_it():
 def test_the_lattice_has_a_bound_however_large_the_region_is():
     _, hull = heard(around(20))
     lattice = lattice_of(hull, 500 * BOX, RESOLUTION)
-    assert np.prod(lattice.shape) < 2 * network.LARGEST
+    assert np.prod(lattice.shape) < 2 * network.MAX_VOXELS
 
 
 def test_each_channel_is_a_voxel_of_its_place():

@@ -13,10 +13,10 @@ from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.meshes import Plane
 from sononerf.start import surface
+from sononerf.start.sheet import MAX_SHEET_THICKNESS
 from sononerf.start.surface import (
-    FACING,
     MANY_POSES,
-    THIN,
+    MIN_FACING,
     Openness,
     confidence_colours,
     known_part,
@@ -27,7 +27,7 @@ from sononerf.start.surface import (
 )
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
-THINNEST = THIN * RESOLUTION
+THINNEST = MAX_SHEET_THICKNESS * RESOLUTION
 CAP = np.radians(30)
 
 
@@ -58,7 +58,7 @@ def farthest_seen(angle=CAP):
     past = np.linspace(0, np.pi / 2, 100_001)  # angle between a normal and the edge's pose
     ahead = DISTANCE * np.cos(past) - RADIUS
     aside = DISTANCE * np.sin(past)
-    return angle + past[np.flatnonzero(ahead / np.hypot(ahead, aside) > FACING)[-1]]
+    return angle + past[np.flatnonzero(ahead / np.hypot(ahead, aside) > MIN_FACING)[-1]]
 
 
 def plate(thickness, side=0.04):
@@ -156,7 +156,7 @@ def test_what_stands_in_the_way_hides_what_lies_behind():
     front, rear = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.02, 0.01))
     rear.apply_translation([-0.04, 0.0, 0.0])
     alone = judge_openness(rear, np.array([[DISTANCE, 0.0, 0.0]]))
-    assert alone.unseen_share == pytest.approx(0.55, abs=0.02)  # faces the pose, by FACING
+    assert alone.unseen_share == pytest.approx(0.55, abs=0.02)  # faces the pose, by MIN_FACING
     both = judge_openness(trimesh.util.concatenate([front, rear]), np.array([[DISTANCE, 0.0, 0.0]]))
     count = len(front.faces)
     np.testing.assert_array_equal(

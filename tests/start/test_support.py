@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.start.evidence import REACH, Evidence, poses_that_heard
+from sononerf.start.evidence import NEIGHBOUR_RADIUS, Evidence, poses_that_heard
 
 RADIUS, RESOLUTION = 0.03, 0.005
 
@@ -22,7 +22,7 @@ def test_a_pose_counts_once_and_only_around_its_points(ball):
     top = [0, 0, RADIUS]
     evidence = evidence_at([top, top, top], [[0, 0, 1]] * 3, [4, 4, 9])
     counts = poses_that_heard(ball, evidence, RESOLUTION)
-    near = np.linalg.norm(ball.vertices - top, axis=1) <= REACH * RESOLUTION
+    near = np.linalg.norm(ball.vertices - top, axis=1) <= NEIGHBOUR_RADIUS * RESOLUTION
     assert (counts[near] == 2).all()
     assert (counts[~near] == 0).all()
 

@@ -27,10 +27,10 @@ def exact(arguments: argparse.Namespace) -> str:
     lines.append("|---|---|---|---|---|---|")
     for name in arguments.bodies:
         small = name != "three_spheres"
-        analysis = judges.SMALL if small else {"frequency_max": 80e3}
+        spectrogram = judges.SMALL if small else {"frequency_max": 80e3}
         case = judges.Case.load(name)
         for engine in arguments.engines:
-            plain = {"scene": {"name": "sphere"}, "spectrogram": analysis}
+            plain = {"scene": {"name": "sphere"}, "spectrogram": spectrogram}
             plain["simulation"] = {"engine": engine, "rays": arguments.rays}
             settings = validate_settings(plain, "benchmark exact")
             simulator = simulator_of(judges.scene_of(name), settings)

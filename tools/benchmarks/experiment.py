@@ -26,7 +26,8 @@ from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from sononerf.settings.schema import Settings
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "three_spheres.yaml"
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / "configs" / "three_spheres.yaml"
 """Settings file with defaults alone; the scene overrides it."""
 STOPPED = tuple(
     code
@@ -36,6 +37,18 @@ STOPPED = tuple(
 """Exit codes of a command that was stopped on purpose."""
 
 Row = dict[str, Any]
+
+
+def rows_of(file: Path) -> list[Row]:
+    """Return the rows of a table; of rows with the same name, seed and calls the last one."""
+    rows: dict[tuple[Any, ...], Row] = {}
+    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue  # a crash tore it
+        rows[row["name"], row.get("seed"), row.get("calls")] = row
+    return list(rows.values())
 
 
 def append_line(path: Path, text: str) -> None:
@@ -135,7 +148,9 @@ def ending(output: Path) -> Iterator[None]:
 def origin() -> dict[str, str]:
     """Return what a table was made with."""
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    return {"sononerf": __version__, "machine": machine}
+    command = ["git", "describe", "--always", "--dirty"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return {"sononerf": __version__, "commit": done.stdout.strip(), "machine": machine}
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:

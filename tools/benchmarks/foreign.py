@@ -8,7 +8,6 @@ chosen are compared with the truth, so that a choice that harms is seen.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import subprocess
 import sys
@@ -35,6 +34,7 @@ from tools.benchmarks.experiment import (
     ending,
     ensemble_name,
     origin,
+    rows_of,
 )
 
 KINDS = (".ply", ".stl", ".obj", ".off")
@@ -43,12 +43,11 @@ STARTS = ("levels", "fuller", "open", "filled", "hull", "sheet")
 """Order of the starts in the table."""
 
 
-def foreign(arguments: argparse.Namespace) -> str:
+def foreign(arguments: argparse.Namespace, output: Path) -> str:
     """Reconstruct all bodies of a folder; one line of JSON for each and number of calls."""
     bodies = sorted(file for file in arguments.foreign.iterdir() if file.suffix.lower() in KINDS)
     if not bodies:
         raise SystemExit(f"error: {arguments.foreign}: holds no mesh ({', '.join(KINDS)})")
-    output = arguments.output or Path("runs") / "foreign"
     file = output / "foreign.jsonl"
     for calls in arguments.calls:
         for body in bodies:
@@ -124,20 +123,6 @@ def scores(mesh: trimesh.Trimesh, truth: Solid) -> Row:
         "parts_true": geometry["components_true"],
         "volume_ratio": geometry["volume_ratio"],
     }
-
-
-def rows_of(file: Path) -> list[Row]:
-    """Return the rows of a table; a line that a crash tore is left out."""
-    if not file.is_file():
-        return []
-    rows: dict[tuple[str, int], Row] = {}
-    for line in file.read_text(encoding="utf-8").splitlines():
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        rows[row["name"], row["calls"]] = row
-    return list(rows.values())
 
 
 def _columns(row: Row) -> Iterator[tuple[str, float]]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,10 +20,12 @@ from tools.benchmarks.experiment import (
     append_line,
     ending,
     origin,
+    rows_of,
     run_experiment,
     shown,
 )
 from tools.benchmarks.foreign import foreign
+from tools.benchmarks.results_page import write_page
 
 SPHERES = "scene.name=three_spheres"
 PROCEDURAL = range(100, 120)
@@ -79,18 +80,24 @@ CASES = (
 
 def surfaces(arguments: argparse.Namespace) -> str:
     """Fit scenes, changed conditions and seeds; one line of JSON for each."""
-    if arguments.foreign is not None:
-        return foreign(arguments)
     output = arguments.output or Path("runs") / "surfaces"
+    if arguments.page:
+        return write_page(output)
+    if arguments.foreign is not None:
+        return foreign(arguments, output)
     file = output / "surfaces.jsonl"
-    lines = _Lines(file)
     for case, seed in chosen_cases(arguments.only, arguments.seeds, arguments.exact is not None):
         experiment = _Experiment(case, seed, output, arguments)
-        if lines.done(experiment.head):
+        if any(
+            "failed" not in row and experiment.head.items() <= row.items() for row in rows_of(file)
+        ):
             continue
         with ending(output):
-            lines.add(experiment.row())
-    return f"{table(lines.rows())}\nwrote {file}"
+            line = storage.to_json(experiment.row())
+            storage.make_folder(output)
+            append_line(file, line)
+            print(line, file=sys.stderr, flush=True)
+    return f"{table(rows_of(file))}\nwrote {file}"
 
 
 def chosen_cases(
@@ -103,38 +110,6 @@ def chosen_cases(
                 raise SystemExit("error: exact: give the ensemble with --exact STORE")
             for seed in seeds if case.repeated else seeds[:1]:
                 yield case, seed
-
-
-class _Lines:
-    """The table on disk; of lines with the same head the last one counts."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-
-    def rows(self) -> list[Row]:
-        if not self.file.is_file():
-            return []
-        rows: dict[tuple[str, int], Row] = {}
-        for line in self.file.read_text(encoding="utf-8").splitlines():
-            try:
-                row = json.loads(line)
-            except ValueError:
-                continue  # a crash tore it
-            rows[row["name"], row["seed"]] = row
-        return list(rows.values())
-
-    def done(self, head: Row) -> bool:
-        """Whether there is a row of these settings; what failed is tried again."""
-        return any(
-            "failed" not in row and all(row.get(key) == head[key] for key in head)
-            for row in self.rows()
-        )
-
-    def add(self, row: Row) -> None:
-        line = storage.to_json(row)
-        storage.make_folder(self.file.parent)
-        append_line(self.file, line)
-        print(line, file=sys.stderr, flush=True)
 
 
 class _Experiment:

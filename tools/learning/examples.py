@@ -92,7 +92,7 @@ def make_example(number: int, folder: Path, meshes: Path | None = None) -> str:
         "level": np.round(-levels.level / DB).astype(np.uint8),
         "emitters": levels.emitters.astype(np.float32),
         "receivers": levels.receivers.astype(np.float32),
-        "onsets": echoes.hull.trusted[levels.poses].astype(np.float32),
+        "onsets": echoes.hull.inlier_onsets[levels.poses].astype(np.float32),
         "axis": np.array([levels.first, levels.spacing, levels.resolution]),
         "lattice": np.array([*lattice.origin, lattice.spacing]),
         "true": np.round(STEPS * true_distance(mesh, lattice)).astype(np.int8),
@@ -177,7 +177,7 @@ class Crop:
         """
         back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
         true = np.ascontiguousarray(np.flip(self.true.transpose(order), back))
-        return *self.places.turned(order, signs), true
+        return *self.places.in_frame(order, signs), true
 
 
 def draw(example: Example, random: np.random.Generator, side: int) -> Crop:

@@ -81,7 +81,7 @@ class _Crops(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
                 order = tuple(random.permutation(3).tolist())
                 signs = tuple(random.choice([-1, 1], 3).tolist())
                 crop = kept[random.integers(len(kept))]
-                yield tuple(torch.from_numpy(one) for one in crop.turned(order, signs))
+                yield tuple(torch.from_numpy(one) for one in crop.in_frame(order, signs))
             batch += step
 
 

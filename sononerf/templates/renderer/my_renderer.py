@@ -41,9 +41,9 @@ class LatticeRenderer(Renderer):
             bins = torch.arange(len(self.frequency), device=rows.device)
         poses = []
         for place, turn, some in zip(position, rotation, rows, strict=True):
-            way = self.lattice - (place + turn @ self.emitter)
-            distance = way.norm(dim=-1)
-            unit = way / distance[:, None]
+            offset = self.lattice - (place + turn @ self.emitter)
+            distance = offset.norm(dim=-1)
+            unit = offset / distance[:, None]
             power = field.select(self.lattice, -unit, bins).abs().square()
             power = power / distance[:, None] ** 4
             power = power * look_up(self.beam[bins], unit @ turn) ** 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Interpretation of recordings and their settings, before anything is written."""
+"""Plan of an import: recordings, poses and settings, completed by each other and checked."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sononerf.head.reception import warn_of_band
 from sononerf.numerics import Ints
 from sononerf.progress import Progress
 from sononerf.recordings.pose_tables import to_poses
-from sononerf.recordings.ranges import calibrated, found_ranges
+from sononerf.recordings.ranges import calibrated, range_limits
 from sononerf.recordings.readers import (
     read_airsas,
     read_folder,
@@ -37,7 +37,7 @@ from sononerf.recordings.recording import (
     check_channels,
     check_numbers,
     clipped_pings,
-    mix,
+    mixed_channels,
 )
 from sononerf.run.build import head_of
 from sononerf.settings.loading import (
@@ -61,13 +61,13 @@ OWN_SETTINGS = "import.yaml"
 
 
 @dataclass(frozen=True, eq=False)
-class Understood:
-    """All that an import knows."""
+class ImportPlan:
+    """Validated recording, poses and settings."""
 
     form: str  # Format of the source
     recording: Recording  # All pings that were read
-    settings: Settings  # Air, ears, call and analysis, complete
-    wanted: ImportSettings  # Settings of the import
+    settings: Settings  # Air, ears, call and spectrogram, complete
+    options: ImportSettings  # Settings of the import
     cutter: Cutter  # Cuts and calibrates pings
     head: Head  # Head of these settings
     pings: Ints  # (P,): Numbers of the pings that are kept
@@ -80,7 +80,7 @@ class Understood:
     notes: tuple[str, ...]  # Interpretations that may surprise
 
 
-def understand(
+def plan_import(
     form: str,
     source: Path,
     output: Path,
@@ -88,7 +88,7 @@ def understand(
     settings_file: Path | None = None,
     overrides: Iterable[str] = (),
     progress: Progress | None = None,
-) -> Understood:
+) -> ImportPlan:
     """Read recordings and settings, and complete each by the other."""
     if form not in READERS:
         raise SettingsError(f"unknown format {form!r}; known: {', '.join(READERS)}")
@@ -107,7 +107,7 @@ def understand(
     settings = _complete(data, recording, import_settings, output, where)
     head = head_of(settings)
     receivers = len(head.receivers)
-    heard = len(mix(np.zeros((recording.read(0).shape[0], 1)), import_settings.channels))
+    heard = len(mixed_channels(np.zeros((recording.read(0).shape[0], 1)), import_settings.channels))
     if heard != receivers:
         raise InputError(
             f"{recording.path}: {heard} channels, and the settings describe {receivers} "
@@ -125,7 +125,7 @@ def understand(
         calibration["compressed"] = call_content(settings.call)
         settings = settings.model_copy(update={"call": CallSettings()})
     check_numbers(recording, cutter, 0)
-    limits, power = found_ranges(
+    limits, power = range_limits(
         head_of(settings), cutter, recording, data.get("spectrogram", {}), progress
     )
     if not power.any():
@@ -148,11 +148,11 @@ def understand(
             where=where,
         )
     there = [cutter.samples(index) / recording.sampling_rate for index in range(len(recording))]
-    return Understood(
+    return ImportPlan(
         form=form,
         recording=recording,
         settings=settings,
-        wanted=import_settings,
+        options=import_settings,
         cutter=cutter,
         head=head,
         pings=kept,
@@ -211,9 +211,9 @@ def _complete(
     table = import_settings.turntable
     if table is not None and table.surface is not None and isinstance(support, dict):
         support.setdefault("point", [0.0, 0.0, table.surface])
-    analysis = data.setdefault("spectrogram", {})
-    if isinstance(analysis, dict):
-        rate = analysis.setdefault("sampling_rate", recording.sampling_rate)
+    spectrogram = data.setdefault("spectrogram", {})
+    if isinstance(spectrogram, dict):
+        rate = spectrogram.setdefault("sampling_rate", recording.sampling_rate)
         if rate != recording.sampling_rate:
             raise SettingsError(
                 f"{where}: spectrogram.sampling_rate is {rate}, the recordings have "
@@ -235,7 +235,9 @@ def _mixed(stated: dict[str, Any], import_settings: ImportSettings) -> dict[str,
     """Return the source's statements about receivers, for the chosen channels."""
     if "receivers" not in stated or import_settings.channels is None:
         return stated
-    places = mix(np.asarray(stated["receivers"], dtype=np.float64), import_settings.channels)
+    places = mixed_channels(
+        np.asarray(stated["receivers"], dtype=np.float64), import_settings.channels
+    )
     return {**stated, "receivers": places.tolist()}
 
 
@@ -245,9 +247,11 @@ def _without_clipped(
     """Return the pings to keep, and how many are clipped where their echoes are."""
     if not import_settings.reject_clipped:
         return np.arange(len(recording)), 0
-    analysis, speed = head.analysis, head.speed_of_sound
-    first = int(analysis.range_min * 2.0 / speed * analysis.sampling_rate - analysis.window / 2.0)
-    last = echo_samples(analysis, speed)
+    spectrogram, speed = head.spectrogram, head.speed_of_sound
+    first = int(
+        spectrogram.range_min * 2.0 / speed * spectrogram.sampling_rate - spectrogram.window / 2.0
+    )
+    last = echo_samples(spectrogram, speed)
     found = [cutter.clipped(index, max(first, 0), last) for index in range(len(recording))]
     bad = clipped_pings(found)
     if bad.all():

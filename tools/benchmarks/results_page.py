@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: MIT
+"""The page of results and the README's table, from the runs of `surfaces`."""
+
+from __future__ import annotations
+
+import json
+import re
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tools.benchmarks.experiment import ROOT, Row, rows_of
+from tools.benchmarks.foreign import STARTS
+
+PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
+MARKS = ("<!-- numbers -->", "<!-- end of the numbers -->")
+"""Lines of the README between which its table stands."""
+BOTH = ("three_spheres", "ua")
+HEAD = """# Results
+
+Written by `python tools/benchmark.py surfaces --page`{origin}.
+Default settings, seed 0 of poses and fit, 400 training poses where no other number is named, and 20
+held-out poses that were drawn apart and never trained on. The echoes come from our own simulator.
+Decibels, active cells and scores are explained in the [README](../README.md). Other work ran on
+the machine, so times are upper limits.
+
+What was measured at other commits (few calls, real recordings, exact echoes, receivers and bands,
+self-calibration, errors of vertices, next poses, earlier versions) is in
+[notes/history.md](notes/history.md).
+"""
+FOREIGN = """
+## Bodies of others
+
+{count} closed bodies that a program of other people composed of boxes, cylinders, wedges and stones
+(the random objects in the data of pybullet 3.2.7, every thirtieth from 302 on; turned at random,
+their parts united, 35 to 140 mm large). None of them was used for a training or a constant. Others
+of the program, with numbers up to 292, are 230 of the 540 bodies of the training of the start
+network. Several versions were measured on these bodies, and the rule by which planes and free
+surfaces are compared was chosen with a look at them, so the figures are a little too good.
+
+```sh
+python tools/benchmark.py surfaces --foreign FOLDER --calls 400
+```
+"""
+OWN = """
+## Scenes of this project
+
+Own scenes, of kinds that the start network was trained on.
+
+```sh
+python tools/benchmark.py surfaces --seeds 0 --only {names}
+```
+"""
+
+
+def write_page(output: Path) -> str:
+    """Write `docs/results.md` and the README's table from the rows and runs in a folder."""
+    own = [row for row in rows_of(output / "surfaces.jsonl") if "failed" not in row]
+    foreign = rows_of(output / "foreign.jsonl")
+    commits = sorted({row["commit"] for row in (*own, *foreign)})
+    if not commits:
+        raise SystemExit(f"error: {output}: holds no finished rows (surfaces.jsonl, foreign.jsonl)")
+    if len(commits) > 1:
+        raise SystemExit(f"error: {output}: rows of several commits ({', '.join(commits)})")
+    machine = (own or foreign)[0]["machine"]
+    text = HEAD.format(origin=f" from runs of commit {commits[0]} ({machine}, no GPU)")
+    if foreign:
+        text += FOREIGN.format(count=len(foreign)) + _foreign_tables(foreign)
+    if own:
+        text += OWN.format(names=" ".join(row["name"] for row in own)) + _own_table(own)
+    runs = {name: output / f"{name}-0" / "metrics.json" for name in BOTH}
+    if all(file.is_file() for file in runs.values()):
+        metrics = {name: json.loads(file.read_text("utf-8")) for name, file in runs.items()}
+        table = _both(metrics)
+        text += "\n## Three spheres and UA\n\n" + table
+        readme = README.read_text(encoding="utf-8")
+        inside = f"{MARKS[0]}\n{table}{MARKS[1]}"
+        pattern = f"{MARKS[0]}.*{MARKS[1]}"
+        README.write_text(re.sub(pattern, lambda _: inside, readme, flags=re.DOTALL), "utf-8")
+    PAGE.write_text(text, encoding="utf-8")
+    return f"wrote {PAGE} and {README}"
+
+
+def _table(lines: Sequence[Sequence[str]]) -> str:
+    rule = ["---"] * len(lines[0])
+    return "".join(f"| {' | '.join(line)} |\n" for line in (lines[0], rule, *lines[1:]))
+
+
+def _foreign_tables(rows: Sequence[Row]) -> str:
+    def spread(of: Callable[[Row], float | None]) -> str:
+        scores = [score for row in rows if (score := of(row)) is not None]
+        middle, least, mean = statistics.median(scores), min(scores), statistics.fmean(scores)
+        return f"{middle:.2f} · {least:.2f} · {mean:.2f}"
+
+    def start(name: str) -> Callable[[Row], float | None]:
+        return lambda row: row["starts"].get(name, {}).get("fscore_2mm")
+
+    present = [name for name in STARTS if any(name in row["starts"] for row in rows)]
+    summary = [
+        ["F-score at 2 mm", "median · least · mean"],
+        ["**result**", f"**{spread(lambda row: row['result']['fscore_2mm'])}**"],
+        *([f"start `{name}`", spread(start(name))] for name in present),
+    ]
+    chamfer = 1e3 * statistics.median(row["result"]["chamfer_m"] for row in rows)
+    five = statistics.median(row["result"]["fscore_5mm"] for row in rows)
+    bodies = [["number", "start `levels`", "F 2 mm", "Chamfer", "parts (true)", "chosen", "time"]]
+    for row in sorted(rows, key=lambda row: str(row["name"])):
+        result = row["result"]
+        bodies.append(
+            [
+                row["name"].removeprefix("random"),
+                f"{row['starts']['levels']['fscore_2mm']:.2f}",
+                f"{result['fscore_2mm']:.2f}",
+                f"{1e3 * result['chamfer_m']:.2f} mm",
+                f"{result['parts']} ({result['parts_true']})",
+                f"`{row['chosen']}`" + ("" if row["kept"] else ", unrefined"),
+                f"{row['fit_s'] + row['surface_s']:.0f} s",
+            ]
+        )
+    said = f"\nMedian Chamfer distance {chamfer:.2f} mm, median F-score at 5 mm {five:.2f}. "
+    return f"\n{_table(summary)}{said}Body by body:\n\n{_table(bodies)}"
+
+
+def _own_table(rows: Sequence[Row]) -> str:
+    lines = [["", "Chamfer", "F 1 · 2 · 5 mm", "parts (true)", "field alone", "all", "time"]]
+    for row in rows:
+        scores = " · ".join(f"{row[f'fscore_{mm}mm']:.2f}" for mm in (1, 2, 5))
+        lines.append(
+            [
+                row["name"],
+                f"{1e3 * row['chamfer_m']:.2f} mm",
+                scores,
+                f"{row['parts']} ({row['parts_true']})",
+                f"{row['rendered_mae_db_active']:.2f} dB",
+                f"{row['heldout_mae_db']:.2f} · {row['heldout_mae_db_active']:.2f} dB",
+                f"{row['seconds']:.0f} s",
+            ]
+        )
+    said = "*Field alone*: active cells. *All*: with traced echoes, all · active cells. "
+    return f"\n{said}*Time*: fit and surface.\n\n{_table(lines)}"
+
+
+def _both(runs: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the table of three_spheres and ua, with noise floor and baselines."""
+
+    def row(title: str, of: Callable[[Mapping[str, Any]], str]) -> list[str]:
+        return [title, *(of(metrics) for metrics in runs.values())]
+
+    def error(metrics: Mapping[str, Any], cells: str) -> str:
+        part = metrics["prediction"]
+        names = (f"mae_db{cells}", f"mean_predictor_mae_db{cells}", f"noise_floor_mae_db{cells}")
+        own, mean, floor = (part[name] for name in names)
+        return f"{own:.2f} dB ({mean:.2f} · {floor:.2f})"
+
+    def scores(part: Mapping[str, Any]) -> str:
+        return " · ".join(f"{part['fscore'][f'0.00{mm}']:.2f}" for mm in (1, 2, 5))
+
+    def distance(metrics: Mapping[str, Any]) -> str:
+        own = metrics["geometry"]["chamfer_m"]
+        others = " · ".join(
+            f"{1e3 * metrics['baseline'][name]['chamfer_m']:.1f}"
+            for name in ("backprojection", "voxels")
+        )
+        return f"{1e3 * own:.2f} mm ({others})"
+
+    def rendered(metrics: Mapping[str, Any]) -> str:
+        part = metrics["prediction"]
+        return f"{part['rendered_mae_db']:.2f} · {part['rendered_mae_db_active']:.2f} dB"
+
+    def times(metrics: Mapping[str, Any]) -> str:
+        names = ("simulate_s", "fit_s", "reconstruct_s")
+        return " · ".join(f"{metrics['cost'][name]:.0f} s" for name in names)
+
+    lines = [
+        ["", *runs],
+        row("the field's rendering alone, held-out, all · active cells", rendered),
+        row(
+            "field and traced echoes, all cells (mean spectrogram · noise floor)",
+            lambda metrics: error(metrics, ""),
+        ),
+        row("the same, active cells", lambda metrics: error(metrics, "_active")),
+        row("Chamfer distance (backprojection · voxel fit)", distance),
+        row(
+            "F-score at 1 · 2 · 5 mm (backprojection)",
+            lambda m: f"{scores(m['geometry'])} ({scores(m['baseline']['backprojection'])})",
+        ),
+        row(
+            "thickness bias · volume over true volume",
+            lambda m: (
+                f"{1e3 * m['geometry']['thickness_bias_m']:+.2f} mm · "
+                f"{m['geometry']['volume_ratio']:.2f}"
+            ),
+        ),
+        row(
+            "parts (true)",
+            lambda m: f"{m['geometry']['components']} ({m['geometry']['components_true']})",
+        ),
+        row("echoes · fit · surface with its files and pictures", times),
+    ]
+    return _table(lines)
