@@ -7,9 +7,8 @@ import numpy as np
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene.composition import Part, compose
 from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene.scene import Part, Scene, compose
 
 from .blade import Blade
 from .bodies import Degrees, turned

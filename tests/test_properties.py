@@ -17,7 +17,7 @@ import sononerf as sn
 from sononerf.echoes.detection import onsets, threshold_levels
 from sononerf.errors import SonoNerfError
 from sononerf.geometry.poses import Poses, euler_from_rotation, rotation_from_euler
-from sononerf.head.decibels import compress, expand
+from sononerf.head.front_end import compress, expand
 from sononerf.recordings.pose_tables import columns_of, read_table, to_poses
 from sononerf.settings.loading import apply_override, dump_yaml, load_settings
 from sononerf.settings.schema import Settings

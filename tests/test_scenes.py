@@ -15,9 +15,8 @@ from sononerf_scenes.bodies import EDGE
 from sononerf.errors import InputError, SettingsError
 from sononerf.evaluation.metrics import Solid
 from sononerf.geometry.meshes import surface_faults
-from sononerf.scene.composition import surfaces_cross
 from sononerf.scene.material import MATERIALS
-from sononerf.scene.scene import list_scenes, load_scene
+from sononerf.scene.scene import list_scenes, load_scene, surfaces_cross
 from sononerf.settings import loading
 from sononerf.testing import check_scene
 

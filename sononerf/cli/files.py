@@ -139,8 +139,13 @@ def import_(
         raise SettingsError("--output is missing; name the store, such as --output data/recorded")
     from sononerf.progress import Progress
     from sononerf.run.build import results_folder
-    from sononerf.run.import_plan import plan_import
-    from sononerf.run.import_recordings import check_before, describe_plan, draw_plan, write_import
+    from sononerf.run.import_recordings import (
+        check_before,
+        describe_plan,
+        draw_plan,
+        plan_import,
+        write_import,
+    )
 
     plan = plan_import(
         form, source, output, settings_file=settings, overrides=overrides or (), progress=Progress()
@@ -228,7 +233,7 @@ def view(
     import signal
     from contextlib import closing, suppress
 
-    from sononerf.run.view import View
+    from sononerf.run.export import View
 
     shown = View(source, port=port)
     say(f"open {shown.viewer.url}; Ctrl-C ends it")

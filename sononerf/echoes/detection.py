@@ -1,5 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Levels of the echoes over range: power of bands of frequencies, averaged over few slices."""
+"""Onsets: the first echo of each pose and ear, and the levels over range that a network reads.
+
+In: spectrograms (E, R, F) of an ensemble. Out: ranges of first echoes (P, E), m, infinite where
+none was heard; levels (P, E, R', 3), dB. The threshold of a range follows from the noise before the
+first echoes, so that false alarms have a constant rate [1]_. Section 1 of ``docs/method.md``.
+
+References:
+    .. [1] H. Rohling, "Radar CFAR thresholding in clutter and multiple target situations", 1983.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +24,7 @@ from scipy.special import gammainc, gammaincinv
 from sononerf.echoes.memory_ensemble import Ensemble, repeats, seal
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import FALSE_ACTIVE_RATE
+from sononerf.head.front_end import FALSE_ACTIVE_RATE
 from sononerf.head.head import Head, PointEcho, own_top
 from sononerf.head.row_filters import band_mean
 from sononerf.numerics import Bools, Floats, Ints, Singles

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Echoes: spectrograms, their head, and results about them; subtraction of a background."""
+"""Echoes: what was heard at many poses, and what follows from it before anything is learned.
+
+In: a store or arrays, with a head. Out: magnitudes (P, E, R, F), poses, splits, and, each at first
+use, onsets, free space, region and levels over range. Sections 1 and 2 of ``docs/method.md``.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError, expect
 from sononerf.geometry.poses import Poses
 from sononerf.head.call import attach, attached
-from sononerf.head.decibels import active_level
+from sononerf.head.front_end import active_level
 from sononerf.head.head import Head
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.settings.schema import HEAD_SECTIONS

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Free space: no part of a body lies nearer to a pose than the pose's first echo.
 
-The point of a body that is nearest to a pose faces it, be it part of a smooth surface, an edge or a
-corner, so it always sends an echo. All places nearer than a pose's first echo are therefore empty,
-whatever the body's shape. The remaining volume is to sound what the visual hull [1]_ is to
-silhouettes: for a convex body, heard from all around, its boundary is the surface. An onset that is
-known to be wrong has weight zero and rules nothing out.
+In: ranges of first echoes (P, E), m. Out: how far a place lies behind them, m. The nearest point of
+a body always sends an echo, be it a smooth surface, an edge or a corner. What is left is to sound
+what the visual hull [1]_ is to silhouettes. An onset that is an outlier has weight zero and rules
+nothing out. Section 2 of ``docs/method.md``.
 
 References:
     .. [1] A. Laurentini, "The visual hull concept for silhouette-based image understanding", 1994.

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf import storage
 from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import RANGE_DB, active_level, compress, mae_db
+from sononerf.head.front_end import RANGE_DB, active_level, compress, mae_db
 from sononerf.numerics import Floats, Ints, Singles
 
 SPLITS = {"train": 0, "val": 1, "test": 2}

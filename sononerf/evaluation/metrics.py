@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from sononerf.errors import NumericalError
 from sononerf.evaluation.prediction import prediction_metrics
 from sononerf.geometry.raycast import contains
-from sononerf.head.decibels import mae_db
+from sononerf.head.front_end import mae_db
 from sononerf.numerics import Bools, Floats
 
 Samples = tuple[Floats, Floats]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A reconstructed surface and the baselines beside the true surface, registered if need be."""
+"""A surface beside the true one: registration, scores, baselines, and comparison of predictions."""
 
 from __future__ import annotations
 

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Predicted spectrograms, and their error in decibels."""
+"""Predicted spectrograms, and their error in decibels.
+
+In: a fitted field, perhaps a surface, poses. Out: magnitudes (P, E, R, F), and the interval that
+holds the measured level with a probability of 90 %. Echoes that the simulator traces off the
+surface are mixed with the field's, by a weight that validation poses give. Section 6 of
+``docs/method.md``.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +25,7 @@ from sononerf.evaluation.traced import Traced, covered, interval_db, learn_trace
 from sononerf.field.fitting import render_poses
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import (
+from sononerf.head.front_end import (
     ACTIVE_DB,
     RANGE_DB,
     compress,

@@ -24,7 +24,7 @@ from sononerf.errors import ResourceError, SonoNerfError
 from sononerf.field.fitting import render_poses
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import RANGE_DB, compress
+from sononerf.head.front_end import RANGE_DB, compress
 from sononerf.head.head import Head
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress

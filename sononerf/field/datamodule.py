@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Batches of range slices, each a function of seed and number alone, and whole poses."""
+"""The LightningDataModule: batches of range slices, each a function of seed and number alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import InputError, SettingsError
-from sononerf.head.decibels import ACTIVE_DB
+from sononerf.head.front_end import ACTIVE_DB
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import DataSettings, FitSettings
 

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Reflection lobes, and the field that has one at every place."""
+"""Reflection lobes, and the field that has one at every place.
+
+In: places (N, 3), m, and unit directions to the emitter (N, 3). Out: magnitude of the reflection
+(N, F). A lobe is strong around its axis, as a face is around its normal. Section 3 of
+``docs/method.md``.
+"""
 
 from __future__ import annotations
 

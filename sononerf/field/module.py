@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Fields and renderers by name: plugins, factories and objects."""
+"""The LightningModule: field, renderer, loss and metrics. It writes no file.
+
+In: batches of range slices. Out: predicted magnitudes (B, E, R, F), the loss, and errors in
+decibels on validation and test poses. Fields and renderers are plugins, made by name. Section 3 of
+``docs/method.md``; the paper's loss and schedule: ``docs/paper.md``.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +28,7 @@ from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import RangeSlices, seed_of
 from sononerf.field.field import Field
 from sononerf.field.renderer import Possible, Renderer, tensor
-from sononerf.head.decibels import ACTIVE_DB, RANGE_DB
+from sononerf.head.front_end import ACTIVE_DB, RANGE_DB
 from sononerf.head.head import Head
 from sononerf.numerics import Floats
 from sononerf.settings.loading import FIELDS, RENDERERS, call, check_options, checked_section, load

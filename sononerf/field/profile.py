@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Renderer `profile`: a fine range profile, seen through the analysis window."""
+"""Renderer ``profile``: a fine range profile of the field, seen through the analysis window.
+
+In: a field, poses (P, 3) and (P, 3, 3). Out: magnitudes (P, E, R, F), differentiable in the field.
+It adds the power of all places in fine range bins, with the true places of emitter and ears,
+spreading and air, and convolves with the power of the window over range. Section 3 of
+``docs/method.md``.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triangle meshes: smooth normals that know a round body from an edge, bodies, and faults."""
+"""Triangle meshes: normals, bodies, faults; and the plane that mirrors them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The emitted call (impulse, sweep with harmonics, or a file's waveform) and its compression."""
+"""The emitted call: impulse, sweep with harmonics or a file, and its compression."""
 
 from __future__ import annotations
 

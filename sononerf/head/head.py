@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The head: emitter, receivers, air, call, noise and front end in one object.
 
-The simulator, the renderers, the refinement, the detection of echoes and the import of recordings
-all use this object.
+In: sections of the settings, or their keys. Out: places (E, 3), gains of beam and ears over
+frequency and direction, ranges (R,) and frequencies (F,) of a spectrogram, and the spectrogram of a
+waveform.
+
+Simulator, renderers, refinement, detection of echoes and import of recordings all use this object.
+Frames and units: ``docs/receivers.md``; how a call is heard: ``docs/simulator.md``.
 """
 
 from __future__ import annotations
@@ -20,15 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.display import NotebookRepr
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.meshes import Plane
-from sononerf.head.air import absorption_in, speed_in
 from sononerf.head.call import call_waveform, covered, emit, load_call, sweep_delay
 from sononerf.head.ears import Ears, analysed_ears, ear_tables, receiver_places
 from sononerf.head.front_end import dechirped_spectrogram, echo_samples, frequency_axis, range_axis
 from sononerf.head.reception import (
+    absorption_in,
     draw_noise,
     effective_window,
     loudest_power,
     noise_level,
+    speed_in,
     target_gain,
     within_band,
 )

@@ -348,7 +348,11 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
 
 
 def read_folder(source: Path, settings: ImportSettings, apart: Collection[Path] = ()) -> Recording:
-    """Read the format ``recordings``."""
+    """Read the format ``recordings``: sound files and a table of poses.
+
+    One file per ping (column ``file``), or one long file (``import.file``, or the only one there)
+    with the time of each emission in the column ``time``.
+    """
     table = source if source.is_file() else source / settings.poses
     if not table.is_file():
         raise InputError(f"{table}: no table of poses; write one line per ping")

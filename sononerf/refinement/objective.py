@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.geometry.directions import usual_gap
-from sononerf.head.decibels import ACTIVE_DB, compress
+from sononerf.head.front_end import ACTIVE_DB, compress
 from sononerf.numerics import Singles
 from sononerf.refinement.optics import Heard, Optics
 from sononerf.refinement.remesh import finer

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sound from the edges between flat faces, with gradients for the vertices.
-
-A flat face is silent but where it mirrors, and what most poses hear of a body with flat faces is
-its edges. They sound as in the simulator (:mod:`sononerf.simulation.diffraction`): each piece of
-an edge is a source with the directivity of a rigid wedge. The directivity depends on how the faces
-lie, so an edge tells of their tilt from all around, and not only where they mirror.
-"""
+"""Flat parts move as planes that meet in edges, whose sound is known."""
 
 from __future__ import annotations
 
@@ -37,6 +31,10 @@ casting, less than anything that is heard."""
 
 class CreaseEdges:
     """Edges of a mesh between faces on different planes.
+
+    A flat face is silent but where it mirrors, and what most poses hear of a body with flat faces
+    is its edges. Each piece of an edge is a source with the directivity of a rigid wedge, as in the
+    simulator. It depends on how the faces lie, so an edge tells of their tilt from all around.
 
     In: faces (T, 3), plane (T,), adjacency (K, 2), ends (K, 2).
 

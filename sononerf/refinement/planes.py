@@ -272,7 +272,12 @@ PATCH_FITS = 3
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Heights over planes, as polynomials of degree 2 or less."""
+    """Heights over planes, as polynomials of degree 2 or less.
+
+    Off the mirror a flat face is silent, and a wave of a two-hundredth of a wavelength on it is as
+    loud as its edges, so vertices that move freely never find one. A plane has three numbers, and
+    the error falls steadily towards the true ones. Three more numbers bend it to a paraboloid.
+    """
 
     centre: Floats  # (N, 3), m: Origins of the planes
     axes: Floats  # (N, 3, 3): Two unit vectors along each plane, and its outward normal

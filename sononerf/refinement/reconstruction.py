@@ -21,8 +21,7 @@ from sononerf.errors import InputError, SettingsError, expect
 from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
-from sononerf.refinement.candidates import number_of_steps
-from sononerf.refinement.descent import poses_that_hear
+from sononerf.refinement.descent import number_of_steps, poses_that_hear
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement, Saved
 from sononerf.settings.loading import checked_section

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Refine a surface against measured spectrograms in stages from coarse to fine; keep the best."""
+"""Refine a surface against measured spectrograms in stages from coarse to fine; keep the best.
+
+In: start surfaces by name, echoes. Out: the surface with the lowest error on validation poses, with
+the error of each vertex. Two loops: all candidates go through the first stage, the better ones
+through the others. In the last stages the simulator corrects the optics. Section 5 of
+``docs/method.md``.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +24,13 @@ from torch import Tensor
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.numerics import Floats
-from sononerf.refinement.candidates import (
+from sononerf.refinement.descent import (
+    POSES,
+    SHARP_EDGE,
+    STAGES,
     Candidate,
+    Descent,
+    Stage,
     after_first_stage,
     are_alike,
     below,
@@ -27,9 +38,9 @@ from sononerf.refinement.candidates import (
     closed_before,
     listed,
     planned,
+    poses_that_hear,
     without_twin,
 )
-from sononerf.refinement.descent import POSES, SHARP_EDGE, STAGES, Descent, Stage, poses_that_hear
 from sononerf.refinement.objective import ErrorLevel, OnsetRanges, SurfaceComparison
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.plane_descent import POSES as PLANE_POSES
@@ -121,7 +132,7 @@ class Refinement:
         """Return the surface that explains the validation poses best.
 
         Every candidate goes through the first stage, and one or two of them through the others, see
-        :func:`~sononerf.refinement.candidates.after_first_stage`.
+        :func:`~sononerf.refinement.descent.after_first_stage`.
         """
         self.first_stage()
         first, *_ = self.candidates

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Operators on a mesh whose vertices move: areas, curvature, smoothing."""
+"""Meshes whose vertices move: areas, curvature, smoothing, and even triangles anew."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.head.decibels import ACTIVE_DB, compress
+from sononerf.head.front_end import ACTIVE_DB, compress
 from sononerf.head.head import Head
 from sononerf.numerics import Floats
 from sononerf.refinement.objective import ERROR_EXPONENT, FLOOR_DB

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Visibility of a surface from emitter and ears, and its rendering."""
+"""Visibility of a surface from emitter and ears, and what the simulator traces off it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Figures and pixels as PNG files; the same picture gives the same bytes."""
+"""Figures and pixels as PNG files, and shaded meshes without OpenGL."""
 
 from __future__ import annotations
 

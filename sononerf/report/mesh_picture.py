@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of meshes."""
+"""Pictures of meshes, and the views of a surface that page and viewer show."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.evaluation.numbers import Evaluation
 from sononerf.evaluation.prediction import Prediction
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 from sononerf.head.head import Head
 from sononerf.numerics import Floats
 from sononerf.report.figure import camera_for

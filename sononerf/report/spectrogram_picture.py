@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import ACTIVE_DB
+from sononerf.head.front_end import ACTIVE_DB
 from sononerf.numerics import Floats, Ints
 from sononerf.report.figure import PictureFormat, figure, picture_bytes, pixels_from_figure
 

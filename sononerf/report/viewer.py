@@ -22,7 +22,7 @@ from sononerf.field.datamodule import RangeSlices
 from sononerf.field.module import EchoModule, decibels
 from sononerf.geometry.lattice import Volume, isosurface, level_surface
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 from sononerf.numerics import Floats
 from sononerf.report.figure import DEFAULT_VIEW
 from sononerf.report.mesh_picture import CLAY, STEEL, SurfaceViews

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settings into objects: head, simulator, true surface; and what a run states about itself."""
+"""Settings into objects: head, simulator, true surface, fitted model; what a run says of itself."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compare a run's surface, and the baselines, with the true surface."""
+"""Compare a run with the true surface, with baselines, and with other runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from sononerf.evaluation.prediction import Prediction
 from sononerf.field.fitting import render_poses
 from sononerf.geometry.lattice import Volume, vti_bytes
 from sononerf.geometry.poses import FrameName, Poses
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 from sononerf.numerics import Floats
 from sononerf.progress import Progress
 from sononerf.report.mip_picture import difference_pngs, overlay_png

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Warnings before a fit that cannot give a useful result."""
+"""Fit a field to an ensemble, then reconstruct, predict and evaluate; go on where it stopped."""
 
 from __future__ import annotations
 

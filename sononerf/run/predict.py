@@ -26,7 +26,7 @@ from sononerf.evaluation.prediction import (
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
 from sononerf.geometry.poses import FrameName, Poses, aim_fault
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
 from sononerf.recordings.pose_tables import read_table, to_poses

@@ -18,7 +18,7 @@ import trimesh
 from sononerf import storage
 from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.evaluation.prediction import evenly, ranked
-from sononerf.head.decibels import compress, mae_db
+from sononerf.head.front_end import compress, mae_db
 from sononerf.numerics import Floats, Ints
 from sononerf.progress import Progress
 from sononerf.report.figure import curves_picture

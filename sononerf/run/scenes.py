@@ -17,7 +17,7 @@ from sononerf import storage
 from sononerf.display import aligned
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import InputError, SettingsError, SonoNerfError
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 from sononerf.report.mesh_picture import mesh_png
 from sononerf.report.scene_picture import echo_png, scene_png
 from sononerf.run.build import simulator_of

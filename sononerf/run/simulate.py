@@ -12,7 +12,7 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.progress import Progress
 from sononerf.recordings.recording import pose_table, wav_bytes
 from sononerf.run.build import head_of, simulator_of
-from sononerf.run.import_plan import OWN_SETTINGS
+from sononerf.run.import_recordings import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import to_yaml
 from sononerf.settings.schema import HEAD_SECTIONS, Settings

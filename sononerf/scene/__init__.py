@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Scenes: surfaces, materials and compositions; the public names for scene plugins."""
 
-from sononerf.scene.composition import Part, compose
 from sononerf.scene.material import MATERIALS, Material, MaterialName
-from sononerf.scene.scene import Scene, SurfaceSizeError, check_surface, list_scenes, load_scene
+from sononerf.scene.scene import (
+    Part,
+    Scene,
+    SurfaceSizeError,
+    check_surface,
+    compose,
+    list_scenes,
+    load_scene,
+)
 
 __all__ = [
     "MATERIALS",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Entry points: scenes, fields and renderers, ours and everyone's, through one door.
+"""Settings files, ``KEY=VALUE`` and plugins, each checked at the door.
 
 A plugin is imported only when its name is used, so a broken one affects nothing else.
 """

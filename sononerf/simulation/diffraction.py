@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Outlines: the edges of bodies that are seen against the background from some place."""
+"""Sound bent by edges and outlines: rigid wedges, and outlines seen against the background."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reflection: a lobe about the mirror direction, its strength, and the remainder that continues."""
+"""Paths of rays: mirror points, the lobe around them, and the remainder that goes on."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The echo simulator: from a scene, a head and poses to the sound at the receivers."""
+"""The echo simulator: from a scene, a head and poses to spectrograms."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sononerf.geometry.poses import (
     random_poses,
     random_sphere_poses,
 )
-from sononerf.head.decibels import RANGE_DB, compress, mae_db
+from sononerf.head.front_end import RANGE_DB, compress, mae_db
 from sononerf.head.head import Head
 from sononerf.numerics import Floats, Singles
 from sononerf.progress import Progress, Task

@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Start surface by a network that reads the levels of all poses, without a fitted field.
+"""The start surface, by a network that reads the levels of all poses, without a fitted field.
 
-In: levels over range and onsets. Out: a closed mesh. Section 4 of ``docs/method.md``.
-
-Flat faces are silent except in the direction of a mirror, and a hollow is heard at its rim and its
-bottom alone, so the echoes do not determine the surface in between. A U-Net [1]_ takes the features
-of all places (:mod:`sononerf.start.features`) and returns the signed distance. It was
-trained on bodies of many kinds, each heard by poses all around, by few, from one side and from a
-belt. Averaging features over views before a 3D network makes the signed distance is the way of
-Atlas [2]_ for images. Lengths are in range resolutions and features are means over poses, so that
-size, band and number of poses may differ.
+In: levels over range and onsets. Out: a closed mesh, m. A U-Net [1]_ takes the features of all
+places (:mod:`sononerf.start.features`) and returns the signed distance [2]_; lengths are in range
+resolutions. Section 4 of ``docs/method.md``.
 
 References:
     .. [1] O. Ronneberger, P. Fischer, T. Brox, "U-Net: convolutional networks for biomedical image

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh files, with the number of poses that heard each vertex, and its error."""
+"""A surface: its mesh, its confidence, its openings, and its files."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats
 from sononerf.start.evidence import ALIGNED, poses_that_heard
 from sononerf.start.occupancy import MIN_EVIDENCE
-from sononerf.start.read_out import Method, Reading
-from sononerf.start.sheet import MAX_SHEET_THICKNESS
+from sononerf.start.read_out import MAX_SHEET_THICKNESS, Method, Reading
 
 MeshFormat = Literal["ply", "stl", "glb"]
 

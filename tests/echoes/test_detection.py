@@ -6,7 +6,7 @@ from scipy.stats import poisson
 from sononerf.echoes.detection import FALSE_ALARMS, Onsets, heard_again, onsets, threshold_levels
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import ACTIVE_DB, active_level, compress
+from sononerf.head.front_end import ACTIVE_DB, active_level, compress
 from sononerf.head.head import Head
 from sononerf.settings.schema import SpectrogramSettings
 

@@ -16,7 +16,7 @@ from sononerf.echoes.memory_ensemble import draw_split, pose_groups, repeats, se
 from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError
 from sononerf.geometry.poses import Poses
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 
 POSES, RANGES, FREQUENCIES = 9, 7, 5
 

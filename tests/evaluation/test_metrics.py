@@ -8,7 +8,7 @@ from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.numbers import added_part, compare
 from sononerf.evaluation.traced import covered, interval_db, learn_interval
 from sononerf.geometry.lattice import Volume, grid_over
-from sononerf.head.decibels import RANGE_DB
+from sononerf.head.front_end import RANGE_DB
 
 RADIUS = 0.015
 

@@ -4,7 +4,7 @@ import pytest
 
 from sononerf.errors import NumericalError
 from sononerf.evaluation.prediction import prediction_metrics
-from sononerf.head.decibels import mae_db
+from sononerf.head.front_end import mae_db
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.head.air import air_absorption, speed_of_sound
-from sononerf.head.decibels import (
+from sononerf.head.front_end import (
     ACTIVE_DB,
     FALSE_ACTIVE_RATE,
     active_level,
@@ -15,6 +14,7 @@ from sononerf.head.decibels import (
     mae_all_and_active,
 )
 from sononerf.head.head import Head, PointEcho, own_top
+from sononerf.head.reception import air_absorption, speed_of_sound
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
 

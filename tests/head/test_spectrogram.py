@@ -6,8 +6,8 @@ import pytest
 import scipy.signal
 
 from sononerf.head.call import call_waveform, sweep_delay
-from sononerf.head.decibels import compress
 from sononerf.head.front_end import (
+    compress,
     dechirped_spectrogram,
     echo_samples,
     frequency_axis,

@@ -8,8 +8,7 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, emit
-from sononerf.run.import_plan import plan_import
-from sononerf.run.import_recordings import spectrogram_of
+from sononerf.run.import_recordings import plan_import, spectrogram_of
 from tests.recordings.recorded import RATE, SETTINGS, arrays, waveforms
 
 LIMITS = ("spectrogram.range_min=0.3", "spectrogram.range_max=0.55")

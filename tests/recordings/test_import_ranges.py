@@ -14,7 +14,7 @@ from sononerf.head.ears import beam_gain, ear_gain, ear_tables
 from sononerf.head.front_end import frequency_axis
 from sononerf.head.head import Head
 from sononerf.recordings.ranges import calibrate_recording
-from sononerf.run.import_plan import plan_import
+from sononerf.run.import_recordings import plan_import
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 from sononerf.settings.sections import ReferenceSettings
 from tests.recordings.recorded import SETTINGS, arrays, waveforms

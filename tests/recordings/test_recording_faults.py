@@ -18,8 +18,7 @@ import pytest
 from scipy.io import wavfile
 
 from sononerf.errors import SonoNerfError
-from sononerf.run.import_plan import plan_import
-from sononerf.run.import_recordings import check_before, describe_plan, write_import
+from sononerf.run.import_recordings import check_before, describe_plan, plan_import, write_import
 from tests.recordings.two_spheres import RATE, SAMPLES, write_folder, write_long
 
 PINGS = 48

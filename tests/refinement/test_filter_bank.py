@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 from sononerf.head.call import emit
 from sononerf.head.front_end import dechirped_spectrogram, range_axis
 from sononerf.head.head import Head
-from sononerf.refinement.filter_bank import Arrivals, FilterBank, fast_length
+from sononerf.refinement.optics import Arrivals, FilterBank, fast_length
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 NODES = (np.arange(19) + 0.5) * 8e3

@@ -15,8 +15,7 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.head import Head
 from sononerf.refinement import objective as objectives_module
 from sononerf.refinement import refine as module
-from sononerf.refinement.candidates import Candidate, best_of, planned
-from sononerf.refinement.descent import Descent, Stage, poses_that_hear
+from sononerf.refinement.descent import Candidate, Descent, Stage, best_of, planned, poses_that_hear
 from sononerf.refinement.objective import ErrorLevel, OnsetRanges
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement

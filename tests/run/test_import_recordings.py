@@ -15,8 +15,13 @@ from sononerf.errors import (
     NumericalError,
     SettingsError,
 )
-from sononerf.run.import_plan import plan_import
-from sononerf.run.import_recordings import check_before, describe_plan, draw_plan, write_import
+from sononerf.run.import_recordings import (
+    check_before,
+    describe_plan,
+    draw_plan,
+    plan_import,
+    write_import,
+)
 from sononerf.storage import lock
 from tests.recordings.recorded import SETTINGS, TARGET, arrays, waveforms
 

@@ -17,8 +17,8 @@ from PIL import Image
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.head.call import attach
-from sononerf.head.decibels import compress
 from sononerf.head.directivity_files import write_sofa
+from sononerf.head.front_end import compress
 from sononerf.run import predict as predict_module
 from sononerf.run.build import with_attached
 from sononerf.run.fit import fit

@@ -17,8 +17,8 @@ from sononerf.errors import (
     NumericalError,
     SettingsError,
 )
-from sononerf.head.decibels import compress
 from sononerf.head.directivity_files import write_sofa
+from sononerf.head.front_end import compress
 from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
     background_path,

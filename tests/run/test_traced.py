@@ -19,7 +19,7 @@ from sononerf.evaluation import traced as traced_module
 from sononerf.evaluation.traced import Traced, mix
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.field.fitting import render_poses
-from sononerf.head.decibels import compress
+from sononerf.head.front_end import compress
 from sononerf.progress import Progress
 from sononerf.run import fit as finish_module
 from sononerf.run import predict as predict_module

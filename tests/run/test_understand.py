@@ -11,8 +11,7 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.head.call import call_waveform
 from sononerf.recordings.recording import wav_bytes
 from sononerf.run.build import with_store
-from sononerf.run.import_plan import plan_import
-from sononerf.run.import_recordings import import_hash, spectrogram_of, write_import
+from sononerf.run.import_recordings import import_hash, plan_import, spectrogram_of, write_import
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import CallSettings
 from tests.recordings.recorded import CALL, EARS, RATE, SETTINGS, arrays, waveforms

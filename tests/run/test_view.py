@@ -20,8 +20,8 @@ import trimesh
 from sononerf.errors import InputError
 from sononerf.geometry.lattice import Volume, vti_bytes
 from sononerf.report.page import RATE, STRETCH, echo_wav
+from sononerf.run.export import View
 from sononerf.run.run import Run
-from sononerf.run.view import View
 from sononerf.start.surface import mesh_bytes
 from tests.browser import CHROMIUM, browser
 

@@ -7,9 +7,8 @@ import trimesh
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.scene.composition import Part, compose
 from sononerf.scene.material import INSECT, LEAF, RIGID
-from sononerf.scene.scene import Scene
+from sononerf.scene.scene import Part, Scene, compose
 
 
 def box(size=(0.02, 0.04, 0.06), **named):

@@ -402,7 +402,7 @@ def test_no_scene_is_heard_more_than_10_mm_before_its_nearest_point(scene, heard
 def heard_near():
     """Return the highest level (dB above m0) of two poses more than 10 mm before the scene."""
     from sononerf.geometry.poses import look_at
-    from sononerf.head.decibels import compress
+    from sononerf.head.front_end import compress
     from sononerf.settings.loading import validate_settings
 
     def level(scene):

@@ -10,7 +10,7 @@ from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import Lattice
 from sononerf.start.evidence import Evidence
 from sononerf.start.occupancy import Gathered
-from sononerf.start.sheet import fit_sheet
+from sononerf.start.read_out import fit_sheet
 
 RESOLUTION = 6e-3
 THICKNESS = 6e-4

@@ -66,7 +66,7 @@ def before(
         distance ((R,), m): Range axis.
         nearest ((P, E), m): Half of the shortest way over the scene.
     """
-    from sononerf.head.decibels import compress
+    from sononerf.head.front_end import compress
 
     worst, reference = 0.0, 1e-3 * float(truth.max())
     for level, ends in zip(compress(magnitude, reference), nearest, strict=True):
@@ -81,7 +81,7 @@ def before(
 
 def errors(found: Magnitude, truth: Magnitude, frequency: Magnitude) -> list[tuple[float, float]]:
     """Return mean error and bias, dB, of the cells near each pose's loudest, by band."""
-    from sononerf.head.decibels import compress
+    from sononerf.head.front_end import compress
 
     reference = 1e-3 * float(truth.max())
     error = compress(found, reference) - compress(truth, reference)
