@@ -31,7 +31,7 @@ AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
     "frequency": ("float64", ("frequency",), ()),
 }
 RESERVED = ("format", "schema_version")
-SAME_PLACE, SAME_ROTATION = 1e-6, 1e-6  # m and no unit: of one pose, printed twice
+SAME_PLACE, SAME_ROTATION = 1e-6, 1e-6  # m and no unit: rounding of a pose that is printed twice
 
 
 def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
@@ -53,7 +53,7 @@ def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
 
 
 def plain_attributes(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return attributes as JSON would give them back, sorted, so that bytes know no order."""
+    """Return attributes as JSON would give them back, sorted: equal ones give equal bytes."""
     plain = {key: value for key, value in attributes.items() if key not in RESERVED}
     try:
         result: dict[str, Any] = json.loads(storage.to_json(plain, sort_keys=True))
@@ -124,7 +124,7 @@ def draw_split(
 
 
 def repeats(poses: Poses, split: NDArray[np.int8]) -> dict[int, int]:
-    """Return, for one ping of each test pose that was heard more than once, another one of it."""
+    """Return a second ping for each test pose that was recorded more than once."""
     groups = pose_groups(poses)
     pairs: dict[int, int] = {}
     for group in np.unique(groups[split == TEST]):
@@ -138,7 +138,7 @@ class Ensemble(ABC):
     """Spectrograms of receivers at every pose; each pose is complete or missing.
 
     Attributes:
-        path: Names the ensemble in messages; its folder where it is on disk.
+        path: Name of the ensemble in messages: its folder, if it is on disk.
     """
 
     path: Path
@@ -206,7 +206,7 @@ class Ensemble(ABC):
         """Return the numbers of the poses that are not there."""
 
     def _checked(self, index: int, spectrogram: ArrayLike) -> Singles:
-        """Return a spectrogram in the type that is kept; refuse one that does not fit."""
+        """Return a spectrogram as float32; refuse another shape, and invalid values."""
         self._refuse_unknown(index)
         values = np.ascontiguousarray(spectrogram, dtype="<f4")
         shape = (self.receivers, len(self._axes["range"]), len(self._axes["frequency"]))
@@ -293,7 +293,7 @@ class MemoryEnsemble(Ensemble):
 def seal(
     ensemble: Ensemble, again: dict[int, Singles], *, silent: str, noise: Floats | None = None
 ) -> None:
-    """Fix the reported decibels and the noise floor of a complete ensemble, which seals it.
+    """Seal a complete ensemble: fix the reference of its decibels and its noise floor.
 
     In: noise ((E, F) or None).
     """

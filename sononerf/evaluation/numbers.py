@@ -27,7 +27,7 @@ from sononerf.scene.scene import Scene
 from sononerf.start.surface import Surface
 
 MIN_POSES_FOR_PROCESS = 64
-"""Number of training poses from which a process of its own saves time."""
+"""Number of training poses from which a separate process saves time."""
 
 RegistrationKind = Literal["none", "rigid", "similarity"]
 
@@ -66,11 +66,11 @@ class Registration:
 def register(
     reconstructed: trimesh.Trimesh, truth: trimesh.Trimesh, kind: RegistrationKind, *, seed: int = 0
 ) -> Registration:
-    """Find the motion that lays one surface over another, by iterated closest points [1]_.
+    """Find the motion that aligns one surface with another, by iterated closest points [1]_.
 
-    Each point of either surface is drawn to the nearest one of the other, so that a part of one
-    surface is not laid over a whole. The iteration starts as the surfaces lie and from all proper
-    alignments of their principal axes; the best result counts. A mirror image is never taken.
+    Distances count in both directions, so that a whole surface is not aligned with a part of the
+    other. Starts are the given position and all proper alignments of the principal axes; the best
+    result is returned. Reflections are excluded.
 
     References:
         .. [1] P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE PAMI
@@ -144,7 +144,7 @@ gives 39."""
 def check_truth(
     reconstructed: trimesh.Trimesh, true: trimesh.Trimesh, kind: RegistrationKind, name: str
 ) -> None:
-    """Refuse a true surface that is of another size, or elsewhere, before any work."""
+    """Refuse a true surface of another size or at another place, before anything is computed."""
     sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (reconstructed, true)]
     times = max(sizes) / max(min(sizes), 1e-12)
     if kind != "similarity" and times > MOST_TIMES:
@@ -165,7 +165,7 @@ def check_truth(
 def signed_error(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> Floats:
     """Return how far each vertex lies off the true surface (V,), m: above zero outside of it.
 
-    Of a true surface that is open there is no inside; then all are above zero.
+    An open true surface has no inside; all values are then positive.
     """
     solid = Solid(true)
     points = np.asarray(mesh.vertices, dtype=np.float64)
@@ -254,7 +254,7 @@ class Comparison:
         strongest ((3,) or None, m): Place of the greatest difference; None where it is nowhere
             above zero.
         score: Greatest difference, as a fraction of the common maximum.
-        poses: At how many poses both were heard.
+        poses: Number of poses at which both were rendered.
     """
 
     first: Volume
@@ -285,7 +285,7 @@ def compare(first: Volume, second: Volume) -> Comparison:
     difference = first.with_values(one.values - other.values)
     index = np.unravel_index(int(difference.values.argmax()), difference.shape)
     score = float(difference.values[index])
-    # Where nothing is stronger the greatest value lies anywhere, often in a corner.
+    # If no value is positive, the place of the maximum means nothing.
     strongest = difference.origin + difference.spacing * np.array(index) if score > 0 else None
     return Comparison(one, other, difference, strongest, score)
 
@@ -300,7 +300,7 @@ def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trime
 
 
 UNITS = {"m": (1e3, "mm"), "db": (1.0, "dB"), "s": (1.0, "s")}
-"""How numbers are shown, by a part of their name after the first: factor and unit."""
+"""Factor and unit in which a number is shown, by a later part of its name."""
 
 
 class Evaluation(dict[str, Any], NotebookRepr):
@@ -346,7 +346,7 @@ def evaluate(
 
     Args:
         surface: Reconstructed, m.
-        truth: The true surface, m; of a scene with a background also the target alone is compared.
+        truth: The true surface, m; of a scene with a background, the target alone is compared too.
         echoes: Give the baselines backprojection and voxel fit; left out where None.
         registration: Motion that lays the reconstruction over the truth first: ``none``, ``rigid``
             or ``similarity``.

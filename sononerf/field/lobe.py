@@ -71,8 +71,8 @@ class LobeField(Field):
     A lobe stands for a piece of surface between two vertices, which is curved: at an angle
     :math:`\theta` off the axis the echo comes from :math:`R(x) (1 - \cos\theta)` nearer. Without
     the radius of curvature :math:`R`, learned late, all echoes off the axis would be too far, and
-    the places would move outward to make up for it. A place without a lobe has no axis to be off,
-    so the lead fades with the lobe, by :math:`1 - e^{-|m|^2}`, which is seen below :math:`|m| = 2`.
+    the places would move outward to make up for it. Without a lobe there is no axis, so the lead
+    fades with the lobe, by :math:`1 - e^{-|m|^2}`; this matters below :math:`|m| = 2`.
 
     In: region ((2, 3), m), frequency ((F,), Hz).
     """
@@ -87,7 +87,7 @@ class LobeField(Field):
         self.register_buffer("curved", torch.zeros(()))
         self.spectrum = nn.Parameter(torch.zeros(count))
         self.sharpness = nn.Parameter(torch.zeros(count))
-        # Cosines over the frequencies to begin with, the slowest first.
+        # The initial spectra are cosines over frequency, the slowest first.
         phase = (torch.arange(count) + 0.5) * (math.pi / count)
         basis = torch.cos(torch.arange(1, self.rank + 1)[:, None] * phase)
         self.basis = nn.Parameter(basis) if self.rank else None
@@ -100,7 +100,7 @@ class LobeField(Field):
         raise NotImplementedError
 
     def advance(self, step: int, total: int) -> None:
-        """Let places be curved once they are about where they belong."""
+        """Learn the radii of curvature once the places are nearly right."""
         self.curved.fill_(float(step >= CURVED_AFTER * total))
 
     # Below, numbers of a place and frequencies come first in memory: what is done to them then
@@ -131,7 +131,7 @@ class LobeField(Field):
 
     @torch.no_grad()
     def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
-        """Return which places answer which emitters, (P, N) bool; by the lobe alone."""
+        """Return which places reflect towards which emitters, (P, N) bool; by the lobe alone."""
         lobe = (self.code(positions) if code is None else code).T[1:4]
         distance = torch.cdist(sources, positions, compute_mode="donot_use_mm_for_euclid_dist")
         towards = sources @ lobe - along(positions, lobe)
@@ -157,7 +157,7 @@ class LobeField(Field):
         response = self._log_response(lobes, tilt, bins).exp()
         if outside is not None:
             response = response.masked_fill(outside[:, None], 0.0)
-        with torch.no_grad():  # the range must not turn the lobes
+        with torch.no_grad():  # the error in range must not rotate the lobes
             off = tilt / length * torch.expm1(-length.square())  # (1 - cos)(1 - exp(-|m|^2))
             off *= RADIUS_UNIT * self.curved
         return response, lobes.radius.squeeze(0) * off

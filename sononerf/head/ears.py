@@ -25,7 +25,7 @@ from sononerf.head.front_end import frequency_axis, smearing
 from sononerf.numerics import Floats, Singles, compiled
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
-SPEED = 343.0  # m/s; the beam's width follows it so weakly that temperature is left out
+SPEED = 343.0  # m/s; the beam's width hardly depends on it, so temperature is ignored
 WIDTH_FREQUENCY = 50e3  # Hz, at which an ear has the width of its setting
 NOTCH_MIDDLE = 60e3  # Hz, at elevation 0
 NOTCH_RISE = 30e3  # Hz, from elevation 0 to straight up
@@ -57,8 +57,8 @@ def piston(directions: Floats, radius: float, frequency: Floats) -> Floats:
 def ear(directions: Floats, side: float, settings: EarSettings, frequency: Floats) -> Floats:
     """Gain of a synthetic, bat-like ear.
 
-    It hears best towards its axis, as a Gaussian of the angle from it whose width falls with the
-    square root of frequency (``width_deg`` at 50 kHz). A spectral notch rises from 30 kHz (straight
+    Its gain is a Gaussian of the angle from its axis. The width falls with the square root of
+    frequency (``width_deg`` at 50 kHz). A spectral notch rises from 30 kHz (straight
     down) over 60 kHz to 90 kHz (straight up), so that the spectrum depends on elevation.
 
     In: directions (L, A, 3), frequency ((F,), Hz). Out: gain (F, L, A).
@@ -84,7 +84,7 @@ GRID_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Ears:
-    """Real, non-negative gains of the beam and of each receiver, and where they are."""
+    """Real, non-negative gains of the beam and of each receiver, and their places."""
 
     azimuth: Floats  # (A,), rad: Uniform from -pi to pi, both included
     elevation: Floats  # (L,), rad: Uniform from -pi/2 to pi/2, both included
@@ -192,7 +192,7 @@ def _measured(settings: EarSettings) -> Directivity | None:
 
 
 def _places(settings: EarSettings, measured: Directivity | None) -> tuple[Floats, list[float]]:
-    """Return places (E, 3) of the receivers, and which way synthetic ears there look."""
+    """Return places (E, 3) of the receivers, and the axes of synthetic ears there."""
     left = np.asarray(settings.left, dtype=np.float64)
     if settings.receivers is not None:
         places = np.asarray(settings.receivers, dtype=np.float64)
@@ -228,15 +228,16 @@ def _measured_tables(measured: Directivity, frequency: Floats) -> tuple[Singles,
 def analysed_ears(
     settings: EarSettings, call: CallSettings, spectrogram: SpectrogramSettings
 ) -> tuple[Ears, Singles | None]:
-    r"""Tables of the same head as an analysis hears it: smeared over frequency by its window.
+    r"""Gains that the rows of a spectrogram measure: smeared over frequency by its window.
 
-    A window of 64 µs cannot tell frequencies apart that lie closer than about 28 kHz. It fills a
+    A window of 64 µs does not resolve frequencies closer than about 28 kHz. It fills a
     narrow notch, and the spectrum of an echo in its middle is that of beam and ear convolved with
     the window's transform. Beam and ear are smeared one by one: the beam varies slowly.
 
     A sweep's frequencies enter the window one after the other. With :math:`G` the gain,
     :math:`X` the call's spectrum, :math:`\tau` its delays and :math:`W` the window's transform,
-    a row at :math:`f` hears by Parseval's theorem the power and, on the mean, as much too late
+    a row at :math:`f` measures, by Parseval's theorem, this mean power, delayed on average by this
+    time
 
     .. math::
         \overline{G}(f)^2 = \frac{\sum_\nu w_\nu G(\nu)^2}{\sum_\nu w_\nu}, \qquad
@@ -250,7 +251,7 @@ def analysed_ears(
     return _analysed(settings, call, spectrogram, directivity_content(settings))
 
 
-@lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
+@lru_cache(maxsize=4)  # a fit and its read-out call this nine times; the arrays must not be changed
 def _analysed(
     settings: EarSettings, call: CallSettings, spectrogram: SpectrogramSettings, content: str | None
 ) -> tuple[Ears, Singles | None]:
@@ -267,7 +268,7 @@ def _analysed(
     beam = fine.beam.astype(np.float64)
     lags: list[Singles] = []
     ears: list[Singles] = []
-    for single in fine.ears[:1] if fine.alike else fine.ears:  # one by one, for memory's sake
+    for single in fine.ears[:1] if fine.alike else fine.ears:  # one by one, to save memory
         ear = single.astype(np.float64)
         if later is None:
             ears.append(np.abs(smeared(ear, weight)).astype(np.float32))

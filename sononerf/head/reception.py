@@ -4,14 +4,14 @@
 Noise is white and Gaussian, set by a signal-to-noise ratio of powers within the analysis
 band, in the waveform as the ear receives it, before dechirp and filters: the mean power of an echo
 over its loudest stretch, as long as the call lasts but at least one analysis window, to the noise's
-power. Whose echo, is a choice:
+power. Which echo is meant is a choice:
 
 ``target``
     That of a target of ``target_strength_db`` at ``target_distance``, on the beam's axis, to an
     ear of gain 1, in air that absorbs nothing. Microphones have one noise level whatever they
-    hear, so this is the default: a pose that hears little is drowned.
+    hear, so this is the default: quiet poses lie below the noise.
 ``pose``
-    Each ear's own, so that all poses are drowned alike. A silent ear has no noise.
+    The ear's own, so that all poses have the same ratio. A silent ear has no noise.
 
 Either way a pose's noise depends on settings, seed and the pose alone.
 """
@@ -52,7 +52,7 @@ def speed_of_sound(temperature_c: float) -> float:
 
 
 def speed_in(air: AirSettings) -> float:
-    """Return the speed of sound (m/s) that settings give: set, of the temperature, or 343."""
+    """Return the speed of sound (m/s) of settings: as set, from the temperature, or 343."""
     if air.speed_of_sound is not None:
         return air.speed_of_sound
     return DEFAULT_SPEED if air.temperature_c is None else speed_of_sound(air.temperature_c)
@@ -173,12 +173,11 @@ def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
 
 logger = logging.getLogger("sononerf")
 
-MAX_WINDOW_RATIO = 2.0  # factor between a window and the best one that is worth a warning
+MAX_WINDOW_RATIO = 2.0  # ratio of a window to the best one, or its inverse, that is worth a warning
 MIN_ECHO = 1e-2
 """Magnitude, over that at its own range, down to which a point echo is followed over time."""
 MAX_OTHER_ECHO = 4.0
-"""Largest magnitude of a point echo at another time, where another harmonic is, over that at its
-own range: 12 dB."""
+"""Largest magnitude of another harmonic's echo of a point over that of its own: 12 dB."""
 
 
 def row_duration(
@@ -220,7 +219,7 @@ def best_window(call: CallSettings, spectrogram: SpectrogramSettings) -> int:
 
 
 def within_band(spectrogram: SpectrogramSettings) -> Floats:
-    """Return the rows' frequencies, the outermost moved to the ends of the wanted band."""
+    """Return the rows' frequencies, the outermost moved to the ends of the analysed band."""
     return np.clip(
         frequency_axis(spectrogram), spectrogram.frequency_min, spectrogram.frequency_max
     )
@@ -286,7 +285,7 @@ def _cropped(row: Floats, call: CallSettings, spectrogram: SpectrogramSettings) 
 
 
 def warn_of_call(call: CallSettings, spectrogram: SpectrogramSettings) -> None:
-    """Log one line for each way in which call and filters do not suit one another."""
+    """Log one line for each mismatch of call and filters."""
     warn_of_band(call, spectrogram)
     best = best_window(call, spectrogram)
     if (

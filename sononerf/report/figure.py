@@ -208,7 +208,7 @@ def draw_mesh(pixels: Floats, mesh: trimesh.Trimesh, camera: Camera, colour: Arr
 
 
 def _crevices(nearness: Floats) -> Floats:
-    """Return how much light reaches each pixel: less where the surroundings stand nearer."""
+    """Return the ambient light of each pixel: less where its surroundings are nearer."""
     there = np.isfinite(nearness)
     if not there.any():
         return np.ones(nearness.shape)

@@ -71,7 +71,7 @@ def mip_picture(
     (left, right), (bottom, top) = extents
     wide, tall = right - left, top - bottom
     inch = LONGEST_SIDE / max(wide, tall)
-    # The colour bar takes the picture's height: give a flat one room for its label.
+    # The colour bar is as high as the picture; a flat picture needs room for its label.
     width, height = max(1.4, wide * inch) + 1.6, max(2.2, tall * inch) + 0.9
     with figure(width, height, 130, layout="compressed") as drawn:
         axes = drawn.subplots()
@@ -90,7 +90,7 @@ def mip_image(
 ) -> NDArray[np.uint8]:
     """Return one projection as pixels (H, W, 3), second axis upwards, without axes or labels.
 
-    Values between voxels are interpolated, so that the longer side comes near ``longest``.
+    Values between voxels are interpolated, so that the longer side has about ``longest`` pixels.
     """
     from matplotlib import colormaps
 

@@ -65,8 +65,8 @@ def quick_image(
 ) -> NDArray[np.uint8]:
     """Return one pose's spectrograms as pixels (H, W, 3), drawn in milliseconds.
 
-    A row per receiver, of four at most; a column per kind of level, and of two the second minus the
-    first; of the axes the ends alone.
+    A row per receiver, at most four; a column per kind of level, and with two kinds a third column
+    with the second minus the first. Only the ends of the axes are labelled.
 
     In: levels_db ((E, R, F), dB), range_m ((R,), m), frequency_hz ((F,), Hz).
     """
@@ -109,9 +109,9 @@ def quick_image(
 
 
 def sounding_slice(spectrograms: NDArray[np.floating], range_m: Floats) -> slice:
-    """Return the part of the range axis that sounds in any of (..., R, F), with a margin.
+    """Return the slices with a sound in any of (..., R, F), with a margin.
 
-    All of it where nothing sounds.
+    All slices if nothing sounds.
     """
     loudest = spectrograms.max(axis=-1).reshape(-1, len(range_m)).max(axis=0)
     active = np.flatnonzero(loudest >= ACTIVE_DB)
@@ -200,7 +200,7 @@ def _drawn(
     if levels == 2:
         panels["predicted − measured"] = panels["predicted"] - panels["measured"]
     width, height = 10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears
-    # Where all pictures have the same parts, a layout need not be found for each of them.
+    # All pictures have the same parts, so one layout serves all of them.
     with figure(width, height, dpi, layout=None) as drawn:
         axes = drawn.subplots(ears, len(panels), sharex=True, sharey=True, squeeze=False)
         sides = {"left": 0.76 / width, "right": 1 - 0.45 / width}
@@ -210,7 +210,7 @@ def _drawn(
         for column, (name, values) in enumerate(panels.items()):
             options: dict[str, Any] = {"cmap": LEVEL_MAP, "vmin": 0, "vmax": top}
             if column == 2:
-                # A single odd cell must not bleach all the others.
+                # One outlier must not set the scale of the colours.
                 worst = _round_up(float(np.quantile(np.abs(values), 0.998)), 3)
                 options = {"cmap": DIFFERENCE_MAP, "vmin": -worst, "vmax": worst}
             axes[0][column].set_title(name)

@@ -55,8 +55,8 @@ FAULTY_FRACTION = 0.5
 """Fraction of a table or a region above which a fault of it is reported, no unit. It is a half,
 since a few repeated poses, or corners out of every pose's reach, do no harm."""
 DEAF_FRACTION = 0.25
-"""Fraction of the poses with an echo that may hear none from the region, no unit. Of a body 70 mm
-beside the region 3 of 8 poses all around heard none; of a body within it all heard one."""
+"""Fraction of the poses with an echo that may have none from the region, no unit. With a body 70 mm
+outside the region, 3 of 8 poses had none; with a body inside it, all had one."""
 MAX_POSE_SPACING = 8.0
 """Mean distance between neighbouring places on a sphere around the region that poses face, range
 resolutions, above which poses are too few. The shipped experiments have 1 to 6. Between such places

@@ -124,8 +124,8 @@ def reconstruct(
     """Write mesh, volume, projections and a view.
 
     The surface is read out of the field and refined against the echoes that the field was fitted
-    to. If a level or a method is given, or if the settings say so, it is not refined unless it is
-    asked for.
+    to. If a level or a method is given, or if the settings say so, it is refined only with
+    ``refine=True``.
 
     Args:
         run: A fitted run.
@@ -165,7 +165,7 @@ def reconstruct(
     )
     with run.locked(None if refines else folder), results_folder(folder):
         truth = _truth(run)
-        # The start levels needs the echoes; all others do with the free space.
+        # The start levels needs the echoes; all others need only the free space.
         heard = run.echoes if refines or method == "levels" else run.hull
         surface = reconstruction.reconstruct(run.model, heard, options=chosen, progress=progress)
         if refines:
@@ -181,7 +181,7 @@ def reconstruct(
 
 
 def _has_echoes(run: Run, progress: Progress) -> bool:
-    """Return whether the run's echoes are there to refine against; say so where they are not."""
+    """Return True if the run's echoes can be opened; report it if they cannot."""
     try:
         return run.echoes is not None
     except InputError as error:

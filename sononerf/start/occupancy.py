@@ -11,7 +11,7 @@ Three kinds of evidence enter one signed distance, see :mod:`sononerf.start.evid
   seen. Such a place is outside, even if the onsets allow a body there (a hollow, a gap).
 
 Few poses face a flat side, so the winding number may be wrong about it; and a field that is fitted
-badly is wrong everywhere. How much of this is believed is the ``Belief``; the caller chooses it by
+badly is wrong everywhere. How much weight this has is the ``StartMode``; the caller chooses it by
 what explains the echoes.
 """
 
@@ -149,7 +149,7 @@ MIN_EVIDENCE = 0.12
 """Weight below which evidence is left out, no unit: -37 dB relative to the loudest of a usual pose.
 The fit places most quieter sound at random."""
 SPAN = {"open": 2.4, "filled": 1.0}
-"""Length over which oriented points outweigh the onsets' bound, range resolutions, for each belief.
+"""Length over which oriented points outweigh the onsets' bound, range resolutions, by mode.
 Over a wider gap the bound stays, unless the winding number opens it."""
 BACKS = (0.02, 0.06)
 """Negative winding number from which a place counts as outside, and the interval over which its
