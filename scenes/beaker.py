@@ -6,8 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, Length, Radius, placed
 from .lathe import lathe

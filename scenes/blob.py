@@ -12,8 +12,7 @@ from numpy.polynomial.legendre import legval
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import EDGE, SIDE, Degrees, placed
 from .lathe import lathe

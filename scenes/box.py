@@ -3,8 +3,7 @@
 
 import trimesh
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, Length, placed
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A capsule: a rod with round ends, curved one way."""
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, Length, Radius, placed, tube
 

@@ -10,7 +10,8 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene.scene import Part, Scene, compose
+from sononerf.scene import Scene
+from sononerf.scene.composition import Part, compose
 
 from .bodies import ball, rounded
 from .composed import OWN, load_within

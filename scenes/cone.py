@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A cone: a tip, a surface that is curved one way, a flat base with a sharp edge."""
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, Length, Radius, placed
 from .lathe import lathe

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from skimage.measure import marching_cubes
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, placed
 

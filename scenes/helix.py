@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import SIDE, Degrees, Length, Radius, Wire, placed
 from .loft import loft

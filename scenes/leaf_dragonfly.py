@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Part, Scene, compose
+from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.composition import Part, compose
 
 from .blade import Blade
 from .bodies import Degrees, turned

@@ -11,8 +11,7 @@ import trimesh
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, placed, tube
 

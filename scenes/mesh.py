@@ -12,8 +12,7 @@ import trimesh
 from pydantic import Field
 
 from sononerf.errors import InputError, SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene, SurfaceSizeError, check_surface
+from sononerf.scene import MATERIALS, MaterialName, Scene, SurfaceSizeError, check_surface
 
 from .mesh_file import IN_METRES, kind_of, read_parts, stacked
 

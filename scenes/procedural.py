@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import placed
 from .box import box

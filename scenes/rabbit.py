@@ -8,8 +8,7 @@ import trimesh
 from pydantic import Field
 
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, ball, placed
 

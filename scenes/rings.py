@@ -4,8 +4,7 @@
 import trimesh
 
 from sononerf.errors import SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, Radius, placed, turned
 from .torus import ring

@@ -6,8 +6,7 @@ from typing import Annotated
 import trimesh
 from pydantic import Field
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 
 def sphere(

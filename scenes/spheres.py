@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 
 def spheres(

@@ -7,8 +7,7 @@ import numpy as np
 import trimesh
 from pydantic import Field
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import Degrees, Length, Radius, placed, walls
 

@@ -13,8 +13,7 @@ from pydantic import Field
 from scipy.spatial import Delaunay, cKDTree
 
 from sononerf.errors import SettingsError
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import SIDE, Degrees, Length, Radius, Wire, placed
 from .lathe import lathe

@@ -10,8 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene.material import MATERIALS, MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MATERIALS, MaterialName, Scene
 
 from .bodies import SIDE, Degrees, Length, placed
 

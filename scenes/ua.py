@@ -5,8 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sononerf.scene.material import MaterialName
-from sononerf.scene.scene import Scene
+from sononerf.scene import MaterialName, Scene
 
 from .spheres import spheres
 
