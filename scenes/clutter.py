@@ -10,8 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sononerf.scene import Scene
-from sononerf.scene.composition import Part, compose
+from sononerf.scene import Part, Scene, compose
 
 from .bodies import ball, rounded
 from .composed import OWN, load_within

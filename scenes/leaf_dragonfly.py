@@ -7,8 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from sononerf.errors import SettingsError
-from sononerf.scene import MATERIALS, MaterialName, Scene
-from sononerf.scene.composition import Part, compose
+from sononerf.scene import MATERIALS, MaterialName, Part, Scene, compose
 
 from .blade import Blade
 from .bodies import Degrees, turned
