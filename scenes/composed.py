@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.scene import Part, Scene, compose
+from sononerf.scene import MATERIALS, MaterialName, Part, Scene, compose, load_scene
 from sononerf.scene.scene import LARGEST_SCALE
 
 from .bodies import Degrees
