@@ -28,8 +28,11 @@ def test_a_distribution_runs_from_an_empty_environment(kind, tmp_path):
     # Packages of others are those of the tests; an editable install of ours is not followed.
     (site / "others.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
     (built,) = (tmp_path / "dist").iterdir()
-    install = ("install", "--no-deps", "--no-index", "--no-build-isolation", str(built))
-    subprocess.run([binaries / "python", "-m", "pip", *install], cwd=tmp_path, check=True)
+    wheel = ("wheel", "--no-deps", "--no-index", "--no-build-isolation", "-w", "wheels", str(built))
+    subprocess.run([sys.executable, "-m", "pip", *wheel], cwd=tmp_path, check=True)
+    (built,) = (tmp_path / "wheels").iterdir()
+    install = [binaries / "python", "-m", "pip", "install", "--no-deps", "--no-index", str(built)]
+    subprocess.run(install, cwd=tmp_path, check=True)
     fit = [binaries / "sononerf", "fit", "three_spheres", *SHORT, "--output", "run"]
     subprocess.run(fit, cwd=tmp_path, check=True)
     assert (tmp_path / "run" / "reconstruction" / "mesh.ply").is_file()

@@ -22,7 +22,7 @@ HEAD = """# Results
 Written by `python tools/benchmark.py surfaces --page`{origin}.
 Default settings, seed 0 of poses and fit, 400 training poses where no other number is named, and 20
 held-out poses that were drawn apart and never trained on. The echoes come from our own simulator.
-Decibels, active cells and scores are explained in the [README](../README.md). Other work ran on
+Decibels, active cells and scores are explained in the README. Other work ran on
 the machine, so times are upper limits.
 
 What was measured at other commits (few calls, real recordings, exact echoes, receivers and bands,
