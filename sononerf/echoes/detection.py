@@ -165,10 +165,7 @@ class Levels(NamedTuple):
 
 
 def threshold_levels(power: Floats, looks: float) -> Levels:
-    """Return the thresholds of noise, and of noise and precursors.
-
-    In: power (..., R).
-    """
+    """Return the thresholds of noise, and of noise and precursors. In: power (..., R)."""
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
     noise = np.maximum(noise, DYNAMIC_RANGE * power.max(initial=0.0))
@@ -298,10 +295,7 @@ def poses_in_use(store: Ensemble) -> Ints:
 
 
 def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = None) -> Onsets:
-    """Detect the echoes of a sealed ensemble's analysed poses.
-
-    In: nearest ((P, E), m).
-    """
+    """Detect the echoes of a sealed ensemble's analysed poses. In: nearest ((P, E), m)."""
     poses = poses_in_use(store)
     axis = np.asarray(store.range, dtype=np.float64)
     heard = (np.square(store.read_pose(int(i)), dtype=np.float64) for i in poses)

@@ -75,10 +75,7 @@ def pose_groups(poses: Poses) -> Ints:
 
 
 def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> NDArray[np.int8]:
-    """Return what each pose is for, (P,): 0 train, 1 validation, 2 test.
-
-    In: split (P,).
-    """
+    """Return what each pose is for, (P,): 0 train, 1 validation, 2 test. In: split (P,)."""
     if split is None:
         return draw_split(poses, where="poses")
     given = np.asarray(split)

@@ -39,10 +39,7 @@ MIN_POSES = 2  # poses: an echo of one pose alone may come from any place of an 
 
 
 class EchoRegion:
-    """Evidence of the poses about places.
-
-    In: rotations (P, 3, 3), resolution (m).
-    """
+    """Evidence of the poses about places. In: rotations (P, 3, 3), resolution (m)."""
 
     def __init__(
         self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Floats, resolution: float

@@ -297,10 +297,7 @@ class EnsembleStore(Ensemble):
         self._attributes = plain
 
     def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
-        """Commit one pose.
-
-        In: spectrogram ((E, R, F) float32).
-        """
+        """Commit one pose. In: spectrogram ((E, R, F) float32)."""
         self._refuse_reading()
         self._spectrogram[index] = self._checked(index, spectrogram)
 

@@ -123,10 +123,7 @@ class Solid:
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Floats, NDArray[np.intp]]:
-    """Draw points uniformly by area.
-
-    Out: points ((count, 3), m), face (count,).
-    """
+    """Draw points uniformly by area. Out: points ((count, 3), m), face (count,)."""
     if not mesh.area > 0:
         raise NumericalError("the mesh has no area to draw points from")
     points, face = trimesh.sample.sample_surface(mesh, count, seed=seed)

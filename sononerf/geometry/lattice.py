@@ -96,10 +96,7 @@ BYTES_PER_VOXEL = 80
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values on a regular grid.
-
-    In: values (X, Y, Z), origin ((3,), m), spacing (m).
-    """
+    """Values on a regular grid. In: values (X, Y, Z), origin ((3,), m), spacing (m)."""
 
     values: NDArray[np.floating]
     origin: Floats

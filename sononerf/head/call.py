@@ -86,10 +86,7 @@ def _envelope(settings: CallSettings, time: Floats) -> Floats:
 
 
 def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
-    """Return which frequencies the call emits.
-
-    In: frequency ((F,), Hz). Out: covered (F,).
-    """
+    """Return which frequencies the call emits. In: frequency ((F,), Hz). Out: covered (F,)."""
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
         return np.ones(f.shape, dtype=bool)

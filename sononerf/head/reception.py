@@ -163,10 +163,7 @@ def noise_level(settings: NoiseSettings, power: Floats, spectrogram: Spectrogram
 
 
 def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
-    """White Gaussian noise, independent for each ear.
-
-    In: level (E,). Out: noise (E, samples).
-    """
+    """White Gaussian noise, independent for each ear. In: level (E,). Out: noise (E, samples)."""
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NOISE_STREAM,)))
     return level[:, None] * generator.standard_normal((len(level), samples))
 

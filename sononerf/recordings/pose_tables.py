@@ -87,10 +87,7 @@ def columns_of(
     texts: dict[str, list[str]] | None = None,
     rotation: ArrayLike | None = None,
 ) -> Columns:
-    """Bring named columns into SI units.
-
-    In: given (dict of (P,) float), rotation (P, 3, 3).
-    """
+    """Bring named columns into SI units. In: given (dict of (P,) float), rotation (P, 3, 3)."""
     values: dict[str, Floats] = {}
     units: dict[str, str] = {}
     for full, column in given.items():

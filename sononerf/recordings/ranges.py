@@ -289,10 +289,7 @@ def analysis_bytes(head: Head, pings: int) -> float:
 def range_limits(
     head: Head, cutter: Cutter, recording: Recording, given: Collection[str], progress: Progress
 ) -> tuple[dict[str, float], Floats]:
-    """Find range limits that are left out from the echoes.
-
-    Out: power (P, E, R).
-    """
+    """Find range limits that are left out from the echoes. Out: power (P, E, R)."""
     spectrogram, speed = head.spectrogram, head.speed_of_sound
     rate = spectrogram.sampling_rate
     lengths = np.array([cutter.samples(index) for index in range(len(recording))])

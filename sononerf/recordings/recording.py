@@ -31,10 +31,7 @@ AUDIO = (*WAV, *OTHERS)
 
 
 def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
-    """Read a sound file.
-
-    Out: sampling_rate (Hz), samples (E, S).
-    """
+    """Read a sound file. Out: sampling_rate (Hz), samples (E, S)."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     stamp = path.stat()
@@ -100,10 +97,7 @@ def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
 
 
 def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> str:
-    """Return the table that the format ``recordings`` reads.
-
-    In: split ((P,) int8).
-    """
+    """Return the table that the format ``recordings`` reads. In: split ((P,) int8)."""
     words = {number: word for word, number in SPLITS.items()}
     angles = (np.degrees(angle) for angle in euler_from_rotation(poses.rotations))
     numbers = np.column_stack([poses.positions, *angles])
@@ -163,10 +157,7 @@ class Channel:
 
 
 def channels_of(power: Floats, looks: float) -> list[Channel]:
-    """Return the state of each channel.
-
-    In: power (P, E, R).
-    """
+    """Return the state of each channel. In: power (P, E, R)."""
     heard = (power > threshold_levels(power, looks).total).any(axis=-1).sum(axis=0)
     loud = np.median(power.max(axis=-1), axis=0)
     noise = np.median(np.quantile(power, RANK, axis=-1), axis=0)

@@ -61,10 +61,7 @@ MIN_SUPPORT = 0.5
 
 
 class Descent:
-    """Preconditioned descent on one connectivity.
-
-    In: smoothing (m).
-    """
+    """Preconditioned descent on one connectivity. In: smoothing (m)."""
 
     def __init__(
         self,
@@ -109,10 +106,7 @@ class Descent:
         return trimesh.Trimesh(self.vertices.cpu().numpy().copy(), self.faces, process=False)
 
     def step(self, number: int, part: float) -> float:
-        """Do one step.
-
-        Out: mismatch (dB).
-        """
+        """Do one step. Out: mismatch (dB)."""
         normals = unit(self.operators.areas(self.vertices))
         gradient, error = self._gradient(number, normals)
         if gradient is None:
@@ -139,10 +133,7 @@ class Descent:
         return error
 
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:
-        """Render poses of the present surface.
-
-        Out: points, areas ((V, 3) float32).
-        """
+        """Render poses of the present surface. Out: points, areas ((V, 3) float32)."""
         area = self.operators.areas(self.vertices)
         bending = self.operators.bending(self.vertices, unit(area), self.passes)
         moved = self._seen is not self.vertices
@@ -210,10 +201,7 @@ _AROUND = 16  # number of vertices among which the opposite one is searched for
 
 
 class Sides:
-    """Opposite vertices of a sheet; those of the rim have no partner.
-
-    In: least (m).
-    """
+    """Opposite vertices of a sheet; those of the rim have no partner. In: least (m)."""
 
     def __init__(self, mesh: trimesh.Trimesh, least: float) -> None:
         places, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)

@@ -66,10 +66,7 @@ class FilterBank:
         self._filters: dict[tuple[int, str], tuple[Tensor, Tensor, Tensor]] = {}
 
     def power(self, arrivals: Mapping[Source, Arrivals], *, receivers: int, frames: int) -> Tensor:
-        """Power of echoes in each frame and row.
-
-        Out: power ((receivers, frames, F) float32).
-        """
+        """Power of echoes in each frame and row. Out: power ((receivers, frames, F) float32)."""
         length = frames * self.spectrogram.hop * self.finer
         spectra = []
         for source, some in arrivals.items():

@@ -212,10 +212,7 @@ triangles are divided."""
 def remesh(
     mesh: trimesh.Trimesh, edge: float, blur: float = 0.0, plane: Plane | None = None
 ) -> trimesh.Trimesh | None:
-    """Return a surface with even triangles.
-
-    In: edge (m), blur (m).
-    """
+    """Return a surface with even triangles. In: edge (m), blur (m)."""
     if not mesh.is_watertight or not len(mesh.faces):
         return None
     spacing = VOXEL_PER_EDGE * edge
@@ -351,10 +348,7 @@ def _of_body(
 
 
 def distance_from(mesh: trimesh.Trimesh, places: Floats, spacing: float) -> Floats:
-    """Return the distance (N,), m, of places (N, 3), m, from a mesh.
-
-    In: spacing (m).
-    """
+    """Return the distance (N,), m, of places (N, 3), m, from a mesh. In: spacing (m)."""
     return np.abs(_heights(places, *_samples(mesh, 0.5 * spacing), spacing))
 
 

@@ -307,10 +307,7 @@ class LaterBounces:
 
 
 class Correction:
-    """Simulated and rendered echoes of one surface, for some poses.
-
-    In: numbers (N,).
-    """
+    """Simulated and rendered echoes of one surface, for some poses. In: numbers (N,)."""
 
     def __init__(
         self,

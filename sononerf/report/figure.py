@@ -114,10 +114,7 @@ AMBIENT = 0.27
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A parallel projection.
-
-    In: axes (3, 3), centre ((3,), m).
-    """
+    """A parallel projection. In: axes (3, 3), centre ((3,), m)."""
 
     axes: Floats
     centre: Floats

@@ -160,10 +160,7 @@ def head_of(settings: Settings) -> Head:
 def module_for(
     settings: Settings, head: Head, region: ArrayLike | None, reference: float
 ) -> EchoModule:
-    """Return an unfitted module that settings describe.
-
-    In: region ((2, 3), m).
-    """
+    """Return an unfitted module that settings describe. In: region ((2, 3), m)."""
     with faults_of(settings.source):
         return EchoModule(
             settings.field.kind,

@@ -66,10 +66,7 @@ GRID_SIDE = 8
 
 
 def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
-    """Return warnings about a fit, one line each.
-
-    In: region ((2, 3), m).
-    """
+    """Return warnings about a fit, one line each. In: region ((2, 3), m)."""
     training = echoes.poses("train")
     warnings = [_repeated(training)]
     if echoes.hull.width < echoes.head.resolution:

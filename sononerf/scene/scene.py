@@ -43,10 +43,7 @@ LARGE, SMALL = 5.0, 5e-3  # m, beyond which a mistaken unit is likelier than suc
 
 
 class SurfaceSizeError(InputError):
-    """A surface far larger or smaller than any scene.
-
-    In: size (m).
-    """
+    """A surface far larger or smaller than any scene. In: size (m)."""
 
     def __init__(self, size: float) -> None:
         super().__init__(f"the mesh is {size:.3g} m large, expected {SMALLEST:g} to {LARGEST:g} m")

@@ -137,10 +137,7 @@ class Arrival:
         self._points: Floats = np.unique(used, axis=0) - self._middle
 
     def shortest(self, emitters: Floats, ears: Floats) -> Floats:
-        """Return the shortest way (P, E), m.
-
-        In: emitters ((P, 3), m), ears ((P, E, 3), m).
-        """
+        """Return the shortest way (P, E), m. In: emitters ((P, 3), m), ears ((P, E, 3), m)."""
         lengths = np.zeros(ears.shape[:2])
         square = np.einsum("nd,nd->n", self._points, self._points)
         for pose, heads in enumerate(np.concatenate([emitters[:, None], ears], axis=1)):

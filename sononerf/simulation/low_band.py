@@ -50,10 +50,7 @@ CHECKS = 200
 
 
 class Equations:
-    """The equations of one frequency, factorised.
-
-    In: spacing (m), wavenumber (1/m).
-    """
+    """The equations of one frequency, factorised. In: spacing (m), wavenumber (1/m)."""
 
     @property
     def bytes(self) -> int:
@@ -514,10 +511,7 @@ def sources_worth(scene: Scene) -> int:
 def low_band(
     scene: Scene, hearing: Hearing, arrival: Arrival, *, sources: int, frequency_min: float
 ) -> LowBand | str:
-    """Return the low band of a scene, or the reason for its absence.
-
-    In: frequency_min (Hz).
-    """
+    """Return the low band of a scene, or the reason for its absence. In: frequency_min (Hz)."""
     if not all(material.rigid for material in scene.materials):
         return "a material is not rigid"
     if not scene.mesh.is_watertight:

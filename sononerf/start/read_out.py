@@ -253,10 +253,7 @@ def read_field(
     levels: RangeLevels | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reading:
-    """Read volume and evidence out of a field.
-
-    In: resolution (m), spacing (m).
-    """
+    """Read volume and evidence out of a field. In: resolution (m), spacing (m)."""
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)
     volume = volume_from_function(energy, lower, upper, step, chunk=_CHUNK, progress=progress)
@@ -342,10 +339,7 @@ def _grid_of(field: Field, spacing: float | None) -> tuple[Floats, Floats, float
 
 
 def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
-    """Return the energy of a field on a grid over its region.
-
-    In: spacing (m).
-    """
+    """Return the energy of a field on a grid over its region. In: spacing (m)."""
     lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     return volume_from_function(_energy(field, directions), lower, upper, spacing, chunk=_CHUNK)
 
