@@ -240,7 +240,7 @@ def _call(function: Callable[..., Any], held: Any, *task: Any) -> Any:
 
 
 def process_context() -> BaseContext:
-    """Return how workers are started: on Linux by a server that has imported what they need."""
+    """Return the start method of workers: on Linux by a server that has imported what they need."""
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")

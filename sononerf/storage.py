@@ -263,7 +263,7 @@ def _prepare(folder: Path) -> None:
 
 
 def is_held(folder: Path) -> bool:
-    """Return whether a living process holds a folder; see :func:`lock`."""
+    """Return True if a living process holds a folder; see :func:`lock`."""
     path = folder / LOCK
     if not path.is_file():
         return False

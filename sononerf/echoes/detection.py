@@ -188,7 +188,7 @@ def threshold_levels(power: Floats, looks: float) -> Levels:
 
 
 def _is_top(power: Floats) -> Bools:
-    """Return which slices are louder than their neighbours, (..., R); the last one may be."""
+    """Return the mask (..., R) of slices that are louder than their neighbours; the last may be."""
     top = np.zeros(power.shape, dtype=bool)
     top[..., 1:-1] = (power[..., 1:-1] >= power[..., :-2]) & (power[..., 1:-1] > power[..., 2:])
     top[..., -1] = power[..., -1] > power[..., -2]

@@ -61,7 +61,7 @@ class Echoes(NotebookRepr):
     Args:
         store: Poses, splits, axes and spectrograms, in memory or on disk.
         head: The head that heard them.
-        hull: The free space, where it is known already; found from the onsets where None.
+        hull: The free space, if known; from the onsets by default.
         box ((2, 3), m): Lower and upper corner of where the body must be, see :meth:`within`.
 
     Attributes:
@@ -235,12 +235,12 @@ class Echoes(NotebookRepr):
         return len(self.store)
 
     def poses(self, split: Split | None = None) -> Poses:
-        """Return the poses of a split; all of them where None."""
+        """Return the poses of a split; all of them by default."""
         some = slice(None) if split is None else self.store.indices(split)
         return Poses(self.positions[some], self.rotations[some])
 
     def numbers_of(self, poses: Poses) -> Ints:
-        """Return which poses of the ensemble these are, (P,).
+        """Return the numbers (P,) of these poses in the ensemble.
 
         Raises:
             InputError: If one is not among them.

@@ -109,7 +109,7 @@ class EchoHull:
         )
 
     def clearance(self, points: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
-        """Return how far points lie behind the first echoes, and which pose leaves them least.
+        """Return the distance of points behind the first echoes, and the pose of the least one.
 
         In: points ((N, 3), m). Out: clearance ((N,), m), negative where an onset rules the point
         out and below the support, plus infinity without evidence; pose (N,).
@@ -122,7 +122,7 @@ class EchoHull:
         return np.concatenate([c for c, _ in parts]), np.concatenate([p for _, p in parts])
 
     def behind(self, points: Floats) -> Floats:
-        """Return how far points lie behind each first echo, (N, P, E) m.
+        """Return the distance of points behind each first echo, (N, P, E) m.
 
         Plus infinity where it has no evidence about them.
         """
@@ -168,7 +168,7 @@ def _is_beside(
 def _behind(
     points: Floats, emitters: Floats, receivers: Floats, first: Floats, axes: Floats, within: float
 ) -> Floats:
-    """Return how far points (N, 3) lie behind first echoes (P, E): (N, P, E), m.
+    """Return the distance of points (N, 3) behind first echoes (P, E): (N, P, E), m.
 
     In: points ((N, 3), m), emitters, receivers ((P, 3), (P, E, 3), m), first ((P, E), m), axes (P,
     3).

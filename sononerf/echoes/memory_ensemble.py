@@ -75,7 +75,7 @@ def pose_groups(poses: Poses) -> Ints:
 
 
 def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> NDArray[np.int8]:
-    """Return what each pose is for, (P,): 0 train, 1 validation, 2 test. In: split (P,)."""
+    """Return the use of each pose, (P,): 0 train, 1 validation, 2 test. In: split (P,)."""
     if split is None:
         return draw_split(poses, where="poses")
     given = np.asarray(split)
@@ -100,7 +100,7 @@ def draw_split(
     seed: int = 0,
     where: str,
 ) -> NDArray[np.int8]:
-    """Draw at random what each pose is for; repeated pings of one pose stay together.
+    """Draw the use of each pose at random; repeated pings of one pose stay together.
 
     Out: split ((P,) int8).
     """

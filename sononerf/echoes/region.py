@@ -177,7 +177,7 @@ class EchoRegion:
             covered = self._covered(points[keep], tolerance)
 
     def _shared(self, points: Floats, tolerance: float, asks: NDArray[np.intp]) -> Floats:
-        """Return how many of some onsets can have come from each place, (N,)."""
+        """Return the number of the onsets that each place explains, (N,)."""
         parts = []
         for start in range(0, len(points), CHUNK):
             distance = cdist(self.sources, points[start : start + CHUNK]).clip(1e-9)
@@ -187,7 +187,7 @@ class EchoRegion:
         return np.concatenate(parts)
 
     def _covered(self, points: Floats, tolerance: float) -> Bools:
-        """Return which slices of each pose the places explain, (P, R)."""
+        """Return the mask (P, R) of the slices that the places explain."""
         covered = np.zeros_like(self.heard)
         for start in range(0, len(points), CHUNK):
             _, row, within = self._rows(points[start : start + CHUNK])

@@ -92,7 +92,7 @@ class Solid:
         return int((np.array(areas) > SMALLEST_PART * max(areas)).sum())
 
     def contains(self, points: Floats) -> Bools:
-        """Return whether points (N, 3), in m, lie inside the union, (N,)."""
+        """Return the mask (N,) of the points (N, 3), m, inside the union."""
         if self.union.is_empty():
             return np.zeros(len(points), bool)
         mesh = _trimesh(self.union)
@@ -219,7 +219,7 @@ class Nearest:
         return distances
 
     def near(self, points: Floats, limit: float) -> Bools:
-        """Return whether points (N, 3) are no farther than a limit, in m; quicker still."""
+        """Return the mask (N,) of points (N, 3) within a distance, m; faster still."""
         given = np.asarray(points, dtype=np.float64)
         close: Bools = self.corners.query(given, distance_upper_bound=limit)[0] <= limit
         rest = np.flatnonzero(~close)
@@ -355,7 +355,7 @@ def _normal_consistency(
 
 
 def _nearest_of(points: Floats, places: Floats) -> NDArray[np.intp]:
-    """Return which of the points is nearest to each place, (N,)."""
+    """Return the index (N,) of the point that is nearest to each place."""
     # Neighbours follow one another, so that their part of the tree is still in the cache.
     cells = ((places - places.min(axis=0)) / max(float(np.ptp(places)), 1e-12) * 64).astype(np.intp)
     order = np.lexsort(cells.T)

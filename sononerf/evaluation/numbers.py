@@ -163,7 +163,7 @@ def check_truth(
 
 
 def signed_error(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> Floats:
-    """Return how far each vertex lies off the true surface (V,), m: above zero outside of it.
+    """Return the signed distance (V,), m, of each vertex from the true surface: positive outside.
 
     An open true surface has no inside; all values are then positive.
     """
@@ -347,10 +347,10 @@ def evaluate(
     Args:
         surface: Reconstructed, m.
         truth: The true surface, m; of a scene with a background, the target alone is compared too.
-        echoes: Give the baselines backprojection and voxel fit; left out where None.
+        echoes: Give the baselines backprojection and voxel fit; left out by default.
         registration: Motion that lays the reconstruction over the truth first: ``none``, ``rigid``
             or ``similarity``.
-        progress: Display of progress; on stderr where None.
+        progress: Display of progress; on stderr by default.
 
     Returns:
         evaluation: ``chamfer_m``, ``fscore`` and the others of
@@ -358,7 +358,7 @@ def evaluate(
             given.
 
     Raises:
-        InputError: If a surface is none.
+        InputError: If an argument is no surface.
         NumericalError: If one is empty or not finite.
     """
     progress = progress or Progress()

@@ -101,13 +101,13 @@ def predict(
         options: Options of the simulator that traces: keys of the section ``simulation`` of the
             settings; engine and number of rays are replaced.
         accelerator: Device to render on: ``auto``, ``cpu`` or ``gpu``.
-        progress: Display of progress; on stderr where None.
+        progress: Display of progress; on stderr by default.
 
     Raises:
         InputError: If the surface does not know its echoes, or a pose is too far from the region
             for anything to be heard.
         SettingsError: If an option is not allowed.
-        ResourceError: If ``gpu`` is asked for and there is none.
+        ResourceError: If ``accelerator`` is ``gpu`` and there is none.
     """
     progress = progress or Progress()
     expect(model, EchoModule, "model")

@@ -33,7 +33,7 @@ class RangeSlices(NamedTuple):
 
 
 def _silent(spectrogram: Tensor, below: float) -> Tensor:
-    """Return which slices of one pose (E, R, F) no ear hears anything in, (R,) bool."""
+    """Return the mask (R,) of the slices of a pose (E, R, F) that are silent at all ears."""
     return spectrogram.amax(dim=(0, 2)) < below
 
 
@@ -253,9 +253,9 @@ class EchoDataModule(lightning.LightningDataModule):
         echoes: The echoes to fit.
         options: Sizes of batches and epochs, and the seed: keys of the section ``fit`` of the
             settings, such as ``{"batch_poses": 8, "steps_per_epoch": 100}``. Those of the module
-            that is fitted where None.
+            that is fitted by default.
         whole_poses: True for batches of whole poses, False for batches of single slices; what the
-            renderer of the module wants where None.
+            renderer of the module wants by default.
         workers: Processes that prepare batches.
         memory_bytes: Largest part of the echoes that is kept in memory, bytes.
 

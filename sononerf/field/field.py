@@ -114,7 +114,7 @@ class Field(nn.Module):
         Args:
             positions ((N, 3), m): Places, world frame.
             directions (..., N, 3): Unit vectors to the emitter, for any number of poses at once.
-            bins ((B,) int or None): Indices of the frequencies; all where None.
+            bins ((B,) int or None): Indices of the frequencies; all by default.
 
         Returns:
             reflectivity: (..., N, B) float or complex.
@@ -137,12 +137,12 @@ class Field(nn.Module):
         return None
 
     def code_of_lattice(self, lattice: Tensor, which: Tensor | None) -> Tensor | None:
-        """Return what :meth:`code` does, for places that are evaluated repeatedly.
+        """Do as :meth:`code`, for places that are evaluated repeatedly.
 
         Args:
             lattice ((L, 3), m): The same tensor as long as the places are the same: the way of
                 reading it may be kept.
-            which ((N,) int or None): Indices of the places; all where None.
+            which ((N,) int or None): Indices of the places; all by default.
 
         Returns:
             code: (N, C) or None.
@@ -151,12 +151,12 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
-        """Return which places send echoes to which emitters.
+        """Return the mask of the places that send echoes to emitters.
 
         Args:
             positions ((N, 3), m): Places, world frame.
             sources ((P, 3), m): Emitters of several poses.
-            code ((N, C) or None): Code of :meth:`code`; found out where None.
+            code ((N, C) or None): Code of :meth:`code`; found out by default.
 
         Returns:
             audible (P, N): False only where the echo may be left out.
@@ -177,10 +177,10 @@ class Field(nn.Module):
         Args:
             positions ((N, 3), m): Places, world frame.
             directions (M, 3): Unit vectors to the emitter.
-            bins ((B,) int or None): Indices of the frequencies; all where None.
+            bins ((B,) int or None): Indices of the frequencies; all by default.
             place ((M,) int or None): Index of the place of each direction, so that a place is
-                evaluated once for all its directions; each has its own place where None.
-            code ((N, C) or None): Code of :meth:`code`; found out where None.
+                evaluated once for all its directions; each has its own place by default.
+            code ((N, C) or None): Code of :meth:`code`; found out by default.
 
         Returns:
             reflectivity ((M, B) float or complex): As in :meth:`select`.
@@ -192,7 +192,7 @@ class Field(nn.Module):
         return self.select(there, directions, bins), torch.zeros_like(directions[:, 0])
 
     def inside(self, positions: Tensor) -> Tensor:
-        """Return which places lie in the region, its faces included, (...,) bool."""
+        """Return the mask (...,) of the places in the region, its faces included."""
         # Places that were computed to lie on a face may miss it by a rounding.
         slack = 4 * torch.finfo(positions.dtype).eps * self.region.abs().max()
         above, below = positions >= self.region[0] - slack, positions <= self.region[1] + slack

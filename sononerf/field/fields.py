@@ -221,7 +221,7 @@ class _Reading:
         return _Product.apply(self._matrix, self._transpose, torch.cat(read, dim=1).T)
 
     def holds(self, places: Tensor, grid: Tensor) -> bool:
-        """Return whether this matrix belongs to these places and to grids like this."""
+        """Return True if this matrix is of these places and of such grids."""
         return self.places is places and self.device == grid.device and self.dtype == grid.dtype
 
 

@@ -135,8 +135,8 @@ def fit(
 
     Args:
         echoes: The echoes to fit.
-        model: Field and renderer; a default one for these echoes where None.
-        data: Streams the echoes; with the module's options where None.
+        model: Field and renderer; a default one for these echoes by default.
+        data: Streams the echoes; with the module's options by default.
         options: Options of the fit: keys of the section ``fit`` of the settings, such as
             ``{"epochs": 40}``; of a model that is given, its own.
         callbacks: Lightning callbacks.
@@ -151,7 +151,7 @@ def fit(
     Raises:
         SettingsError: If an option is not allowed, or options are given beside a model.
         NumericalError: If a gradient or a parameter is not finite.
-        ResourceError: If ``gpu`` is asked for and there is none.
+        ResourceError: If ``accelerator`` is ``gpu`` and there is none.
     """
     accelerator = usable_accelerator(accelerator)
     if model is None:

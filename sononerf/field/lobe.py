@@ -131,7 +131,7 @@ class LobeField(Field):
 
     @torch.no_grad()
     def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
-        """Return which places reflect towards which emitters, (P, N) bool; by the lobe alone."""
+        """Return the mask (P, N) of places that reflect towards emitters; by the lobe alone."""
         lobe = (self.code(positions) if code is None else code).T[1:4]
         distance = torch.cdist(sources, positions, compute_mode="donot_use_mm_for_euclid_dist")
         towards = sources @ lobe - along(positions, lobe)

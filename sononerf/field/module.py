@@ -123,14 +123,14 @@ class EchoModule(lightning.LightningModule):
             a renderer.
         reference: Magnitude m0 of the reported decibels.
         region ((2, 3), m): Lower and upper corner of the box that holds the field; that of a field
-            object where None.
+            object by default.
         head: The head that heard the echoes, or what ``Head.plain`` says of it; needed unless
             field and renderer are objects.
         field_options, renderer_options: Keyword arguments of the factories.
         options: Options of the fit: keys of the section ``fit`` of the settings, such as
             ``{"learning_rate": 0.05, "loss": "l2", "schedule": "staircase", "seed": 1}``.
         dynamic_range_db: Level below the loudest cell at which the fit's own compression starts;
-            the head's (``spectrogram``) where None.
+            the head's (``spectrogram``) by default.
         possible: Test of places against the echoes.
 
     Attributes:
@@ -220,7 +220,7 @@ class EchoModule(lightning.LightningModule):
         Args:
             echoes: The echoes to fit.
             field, renderer, field_options, renderer_options, options: As of the class.
-            region ((2, 3), m): Lower and upper corner; where None, the box of the echoes
+            region ((2, 3), m): Lower and upper corner; by default the box of the echoes
                 (:meth:`sononerf.Echoes.within`), or found from the echoes.
 
         Raises:
@@ -365,7 +365,7 @@ class EchoModule(lightning.LightningModule):
                 parameter.copy_(self.trainer.strategy.reduce(parameter.clone(), reduce_op="mean"))
 
     def range_db(self, step: int) -> float:
-        """Return how far below the loudest cell the loss hears, at a step, in dB."""
+        """Return the level below the loudest cell down to which the loss counts at a step, dB."""
         if step < self.options.early_share * self.total_steps:
             return min(self.options.early_range_db, self.dynamic_range_db)
         return self.dynamic_range_db

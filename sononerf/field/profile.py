@@ -203,7 +203,7 @@ class ProfileRenderer(Renderer):
         return places
 
     def _draw(self) -> tuple[Tensor | None, Tensor | None]:
-        """Return which of the kept places are this step's, and their weights; None for all."""
+        """Return the indices of the places of this step, and their weights; None for all."""
         if not self.training or len(self._kept_places()) <= self.points:
             return None, None
         energy = self.energy[self.kept]

@@ -149,7 +149,7 @@ class Renderer(nn.Module):
             position ((P, 3), m): Place of the head.
             rotation (P, 3, 3): Head to world.
             rows (P, R): Indices of the range slices of each pose.
-            bins ((B,) int or None): Indices of the frequencies; all where None.
+            bins ((B,) int or None): Indices of the frequencies; all by default.
 
         Returns:
             magnitude (P, E, R, B): Linear.

@@ -103,7 +103,7 @@ def _smooth_corners(mesh: trimesh.Trimesh, crease: float) -> NDArray[np.int32]:
 
 
 def bodies(mesh: trimesh.Trimesh) -> Ints:
-    """Return which connected part of the mesh each triangle belongs to (T,)."""
+    """Return the number of the connected part of each triangle (T,)."""
     count = len(mesh.faces)
     pairs = np.asarray(mesh.face_adjacency, dtype=np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))

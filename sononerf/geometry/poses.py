@@ -88,7 +88,7 @@ class Poses(NotebookRepr):
             count: Number of poses.
             radius (m): Distance from the origin.
             aim_jitter (rad): Standard deviation of the two turns about the head's own y and z axes.
-            generator: Draws the turns; one of seed 0 where None.
+            generator: Draws the turns; one of seed 0 by default.
 
         Raises:
             InputError: If there is no pose, or the radius is not above zero.

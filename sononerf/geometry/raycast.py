@@ -316,7 +316,7 @@ slip between two triangles. None is parallel to an axis, because many faces are.
 
 
 def contains(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Bools:
-    """Return which points lie inside closed bodies: a ray leaves through what it meets first.
+    """Return the mask of the points inside closed bodies: a ray leaves through what it meets first.
 
     In: vertices ((V, 3), m), faces (T, 3), points ((N, 3), m).
     """

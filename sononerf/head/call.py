@@ -86,7 +86,7 @@ def _envelope(settings: CallSettings, time: Floats) -> Floats:
 
 
 def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
-    """Return which frequencies the call emits. In: frequency ((F,), Hz). Out: covered (F,)."""
+    """Return the mask (F,) of the frequencies (F,), Hz, that the call emits."""
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
         return np.ones(f.shape, dtype=bool)
@@ -96,7 +96,7 @@ def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
 
 
 def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
-    """Return whether a point may be heard at several ranges in a row that is dechirped once.
+    """Return True if a point may appear at several ranges in a row that is dechirped once.
 
     That is so where several harmonics sweep over one of the frequencies, each at a time of its own,
     and has to be expected of a file.
@@ -274,7 +274,7 @@ class CallFile:
         return np.asarray(scipy.signal.resample_poly(self.waveform, up, down), dtype=np.float64)
 
     def covers(self, frequency: Floats) -> Bools:
-        """Return which frequencies (F,) the call emits."""
+        """Return the mask (F,) of the frequencies that the call emits."""
         return np.any([(frequency >= a) & (frequency <= b) for a, b in self.bands], axis=0)
 
     def delay_at(self, frequency: Floats) -> Floats:
@@ -283,7 +283,7 @@ class CallFile:
         return np.interp(frequency, self.frequency[known], self.delay[known])
 
     def rate_at(self, frequency: Floats) -> Floats:
-        """Return how fast the call sweeps over frequencies (F,), Hz/s."""
+        """Return the sweep rate at frequencies (F,), Hz/s."""
         low, high = self.frequency[self.is_covered][[0, -1]]
         below = np.clip(frequency - self.bandwidth / 2.0, low, high)
         above = np.clip(frequency + self.bandwidth / 2.0, low, high)
@@ -366,7 +366,7 @@ def _first_top(power: Floats) -> int:
 
 
 def _loud(waveform: Floats, rate: float, frequency: Floats, bandwidth: float) -> Bools:
-    """Return which frequencies (F,) lie within 20 dB of the loudest."""
+    """Return the mask (F,) of the frequencies within 20 dB of the loudest."""
     power = np.abs(np.fft.rfft(waveform, 4 * len(waveform))) ** 2
     step = rate / (4 * len(waveform))
     wide = max(1, round(SMOOTHING * bandwidth / step))

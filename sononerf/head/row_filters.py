@@ -77,7 +77,7 @@ class RowFilters:
         return self.origin + self.envelope.shape[1]
 
     def point_echo(self) -> Floats:
-        """Return how an impulse swells and fades in each row, (F, W') over samples.
+        """Return the envelope of an impulse in each row, (F, W') over samples.
 
         The frame's time is in the middle of the W' samples.
         """
@@ -183,7 +183,7 @@ def _gammatone(settings: SpectrogramSettings) -> RowFilters:
 
 
 def _looks(envelope: Floats, frequency: Floats, rate: float) -> float:
-    """Return how many independent values white noise has in the mean power over the band.
+    """Return the number of independent values of white noise in the mean power over the band.
 
     It is the squared mean over the variance: overlapping rows share noise.
     """
@@ -198,7 +198,7 @@ def _looks(envelope: Floats, frequency: Floats, rate: float) -> float:
 
 
 def _ring_off() -> float:
-    """Return how long after its peak the gammatone has fallen to the floor, over b."""
+    """Return the time from the peak of the gammatone to its floor, over b."""
     x = np.linspace(1.0, 20.0, 20_000)
     last = x[(x * np.exp(1.0 - x)) ** (ORDER - 1) >= FLOOR][-1]
     return float((last - 1.0) * PEAK)

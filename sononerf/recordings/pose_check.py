@@ -222,7 +222,7 @@ def check_poses(
 
 
 def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: PoseMisfit) -> Verdict:
-    """Return whether all ranges times a factor fit the poses clearly better.
+    """Return a verdict if all ranges times one factor fit the poses clearly better.
 
     Poses at one distance from the body fit ranges of any scale.
     """
@@ -309,7 +309,7 @@ class Consistency:
         return PoseMisfit(float(total), count, prediction)
 
     def _hears_direction(self) -> bool:
-        """Return whether it matters which way the head looks."""
+        """Return True if the orientation of the head matters."""
         return bool(np.abs(self.receivers - self.emitter).max() > 0.0)
 
 
@@ -340,7 +340,7 @@ def _length(metres: float) -> str:
 
 
 def _late(poses: Poses, prediction: RangePrediction, resolution: float) -> Verdict:
-    """Return whether the ranges are too long for any body amid the poses."""
+    """Return True if the ranges are too long for any body amid the poses."""
     away = poses.positions - prediction.centre
     distance = np.linalg.norm(away, axis=1)
     direction = away / np.maximum(distance, 1e-12)[:, None]
@@ -360,7 +360,7 @@ def _late(poses: Poses, prediction: RangePrediction, resolution: float) -> Verdi
 
 
 def _turns(poses: Poses) -> bool:
-    """Return whether poses are those of a turntable: on a cylinder, level, looking at its axis."""
+    """Return True if poses are those of a turntable: on a cylinder, level, looking at its axis."""
     forward = poses.rotations[:, :, 0]
     if np.abs(forward[:, 2]).max() > 0.05:
         return False

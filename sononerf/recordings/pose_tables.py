@@ -51,7 +51,7 @@ class Columns:
         return 0 if self.rotation is None else len(self.rotation)
 
     def has(self, *names: str) -> bool:
-        """Return whether there are all of these columns."""
+        """Return True if all of these columns are there."""
         return all(name in self.values for name in names)
 
     def take(self, rows: ArrayLike) -> Columns:

@@ -314,7 +314,7 @@ class Cutter:
         return 0 if self.call is None else len(self.call) - 1
 
     def clipped(self, index: int, first: int, last: int) -> Clipping:
-        """Return how a ping's loudest samples look, between two samples after the emission."""
+        """Return the shape of a ping's loudest samples, between two samples after the emission."""
         samples = self.recording.read(index)
         begin = round(self._emission(index))
         part = np.asarray(samples[:, max(begin + first, 0) : max(begin + last, 0)])
@@ -354,7 +354,7 @@ class Clipping:
 
 
 def clipped_pings(clippings: list[Clipping]) -> Bools:
-    """Return which pings are clipped, (P,).
+    """Return the mask (P,) of clipped pings.
 
     A ping is clipped if one of its channels has three samples or more that equal a neighbour, at a
     value that no ping of this channel exceeds, or at full scale; upward or downward.

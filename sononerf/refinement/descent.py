@@ -421,7 +421,7 @@ def _better(candidates: list[Candidate]) -> Candidate:
 
 
 def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
-    """Return whether two surfaces sound alike after the first stage, at the shortest wavelength."""
+    """Return True if two surfaces sound alike after the first stage, at the shortest wavelength."""
     return (
         float(distances(one.meshes[1], other.meshes[1]).mean())
         <= SAME_SURFACE_DISTANCE * wavelength
@@ -439,7 +439,7 @@ def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], 
 
 
 def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:
-    """Return whether a surface encloses a body, as far as the poses of a hull can have heard it."""
+    """Return True if a surface encloses a body, as far as the poses of a hull can have heard it."""
 
     def is_closed(mesh: trimesh.Trimesh) -> bool:
         found = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)
@@ -454,7 +454,7 @@ def listed(
     candidates: list[Candidate],
     chosen: Candidate,
 ) -> list[dict[str, Any]]:
-    """Return what is told of the candidates, see ``Refined.candidates``."""
+    """Return the candidates as plain data, see ``Refined.candidates``."""
 
     def finite(value: float | None) -> float | None:
         return value if value is not None and math.isfinite(value) else None

@@ -361,7 +361,7 @@ class Optics(nn.Module):
     def near_mirror(
         self, points: Tensor, area: Tensor, bending: Tensor, emitters: Tensor, ears: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return which pieces send sound towards an ear, and their attenuation.
+        """Return the mask of the pieces that send sound to an ear, and their attenuation.
 
         In: points, area (..., 3), bending ((..., 6), 1/m), emitters, ears ((..., 3), m). Out:
         facing (...,), spread, detour, path, exponent (...,).

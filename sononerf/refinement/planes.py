@@ -394,7 +394,7 @@ def on_patches(
 
 
 def motions(vertices: Floats, faces: Ints, part: Ints, patches: Patches, terms: int) -> csr_array:
-    """Return how the vertices move with the numbers of their patches.
+    """Return the derivatives of the vertices by the numbers of their patches.
 
     In: vertices ((V, 3), m), faces (T, 3), part (T,). Out: motion (3 V, K N).
     """

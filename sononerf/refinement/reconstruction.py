@@ -76,7 +76,7 @@ def reconstruct(
         echoes: The fitted echoes, or their free space.
         options: Keys of the section ``reconstruction`` of the settings, such as ``{"spacing":
             0.002, "method": "hull"}`` or ``{"method": "isosurface", "level": 0.5}``.
-        progress: Display of progress; on stderr where None.
+        progress: Display of progress; on stderr by default.
 
     Returns:
         surface: Not refined.
@@ -175,7 +175,7 @@ def refine(
         saved: Stages that are done are kept here. Given again with the same surface and echoes,
             they are not repeated.
         after_stage: Called with the surface of a stage and its error on validation poses, dB.
-        progress: Display of progress; on stderr where None.
+        progress: Display of progress; on stderr by default.
 
     Returns:
         surface: The best one; the start where all refined ones explain the validation poses clearly
@@ -183,7 +183,7 @@ def refine(
 
     Raises:
         SettingsError: If an option is not allowed, or the surface is an iso-surface.
-        ResourceError: If ``gpu`` is asked for and there is none.
+        ResourceError: If ``accelerator`` is ``gpu`` and there is none.
     """
     progress = progress or Progress()
     expect(surface, Surface, "surface")

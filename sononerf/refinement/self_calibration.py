@@ -260,7 +260,7 @@ class Calibrator:
         return total / count if count else math.inf
 
     def result(self) -> Estimate:
-        """Return what was found so far."""
+        """Return the present estimate."""
         calibration = Calibration(self.gain)
         deviation: dict[str, float] = {}
         spread = self.stretch * np.sqrt(np.diag(self._covariance))

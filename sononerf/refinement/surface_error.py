@@ -255,7 +255,7 @@ class Misfit:
 
 
 def _cover(places: Floats) -> Ints:
-    """Return which points (N, K) have all others within a distance of 1 of one of them."""
+    """Return a subset of points (N, K): each other one is within a distance of 1 of it."""
     tree, left, centres = cKDTree(places), np.ones(len(places), dtype=bool), []
     for number, place in enumerate(places):
         if left[number]:
@@ -306,10 +306,10 @@ def next_poses(
         surface: Refined, with errors.
         echoes: Echoes that were heard so far.
         count: Number of poses.
-        candidates: Poses to choose among; those of ``within`` where None.
+        candidates: Poses to choose from; those of ``within`` by default.
         within: Places of candidates, which look at the middle of the surface.
         seed: Seed of poses and probes.
-        progress: Display of progress; on stderr where None.
+        progress: Display of progress; on stderr by default.
 
     Returns:
         poses: The best one first.

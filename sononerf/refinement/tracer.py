@@ -34,7 +34,7 @@ it."""
 
 
 def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bools:
-    """Return which points (N, 3) on the surface are seen from targets (N, 3), m.
+    """Return the mask of points (N, 3), m, on the surface that targets (N, 3) see.
 
     In: points, target ((N, 3), m), free (m).
     """

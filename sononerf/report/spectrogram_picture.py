@@ -139,7 +139,7 @@ def _checked(
 
 
 def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[Ints, list[str]]:
-    """Return which receivers are drawn, evenly chosen, and their names."""
+    """Return the receivers that are drawn, evenly chosen, and their names."""
     chosen = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
     if count == 2:
         return chosen, ["left ear", "right ear"]

@@ -375,5 +375,5 @@ def load_traced(path: Path) -> Traced | None:
 
 
 def same_mesh(one: trimesh.Trimesh, two: trimesh.Trimesh) -> bool:
-    """Return whether two meshes have the same vertices and triangles."""
+    """Return True if two meshes have the same vertices and triangles."""
     return np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)

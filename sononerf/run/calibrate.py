@@ -200,7 +200,7 @@ def calibrate(
 
 
 def _is_turntable(positions: Floats) -> bool:
-    """Return whether poses (P, 3), m, are at one distance from the z axis."""
+    """Return True if poses (P, 3), m, are at one distance from the z axis."""
     distance = np.linalg.norm(positions[:, :2], axis=1)
     return bool(np.ptp(distance) < ON_CYLINDER * distance.mean())
 
@@ -241,7 +241,7 @@ def _estimate(
 
 
 def dependent_cells(spectrogram: SpectrogramSettings) -> float:
-    """Return how many cells of a spectrogram share their noise, no unit, 1 or more."""
+    """Return the number of cells of a spectrogram that share their noise, no unit, 1 or more."""
     frequency = np.linspace(spectrogram.frequency_min, spectrogram.frequency_max, 64)
     duration, bandwidth = (part.mean() for part in row_widths(spectrogram, frequency))
     rows = (

@@ -70,7 +70,7 @@ def evaluate(
 
     Args:
         run: A run that was reconstructed.
-        truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
+        truth: File of the true surface; ``evaluation.truth`` of the run's settings by default, or
             else the surface of its scene.
         registration, unit, frame: Its registration, unit and frame; those of the settings where
             None.
@@ -80,7 +80,7 @@ def evaluate(
         metrics: All of ``metrics.json``.
 
     Raises:
-        InputError: If the run is none, or the true surface cannot be read.
+        InputError: If there is no run, or the true surface cannot be read.
     """
     progress = progress or Progress(quiet=True)
     run = Run.of(run)

@@ -328,7 +328,7 @@ class View:
         self.viewer.say(f"**{self.run.path.resolve().name}**: {text}.")
 
     def _is_new(self, name: str, file: Path) -> bool:
-        """Return whether a file has come or changed since the last look."""
+        """Return True if a file has come or changed since the last look."""
         if not file.is_file():
             return False
         state = (str(file), file.stat().st_mtime_ns)

@@ -210,7 +210,7 @@ a slow network disk takes a minute."""
 
 
 def follows() -> bool:
-    """Return whether this process is one of several that fit together, and not the first."""
+    """Return True if this process is one of several that fit together, and not the first."""
     return int(getattr(rank_zero_only, "rank", 0)) > 0
 
 

@@ -334,8 +334,8 @@ def read_recordings(
         form: ``recordings``, ``numpy``, ``sonotracelab``, ``sononerf-matlab`` or ``airsas``.
         options: Sections of the import's settings, such as ``{"air": {"temperature_c": 20},
             "ears": {"directivity": "omnidirectional"}, "import": {"frame": "ned"}}``.
-        settings_file: Settings of the import; ``import.yaml`` beside the recordings where None.
-        progress: Display of progress; on stderr where None.
+        settings_file: Settings of the import; ``import.yaml`` beside the recordings by default.
+        progress: Display of progress; on stderr by default.
 
     Returns:
         echoes: Complete. What the first echoes say against the poses is logged as a warning.

@@ -95,7 +95,7 @@ def predict(
         split: Split whose poses are predicted.
         poses_csv: Poses of the user's instead; see :func:`read_poses`.
         frame: Frame of these poses.
-        output: Folder of the results; ``RUN/prediction`` where None.
+        output: Folder of the results; ``RUN/prediction`` by default.
         pictures: Number of poses that are drawn: from the best to the worst where they were
             measured, else from the first to the last.
         accelerator: Device to render on.

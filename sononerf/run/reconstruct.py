@@ -129,12 +129,12 @@ def reconstruct(
 
     Args:
         run: A fitted run.
-        spacing (m): Voxel size; the settings' where None.
+        spacing (m): Voxel size; the settings' by default.
         level ("auto" or None): A number asks for an iso-surface of this level; the settings' where
             None.
-        method: Method of the read-out; that of the settings where None.
-        refine: Whether to refine the surface; where None, as above.
-        output: Folder of the results; ``RUN/reconstruction`` where None.
+        method: Method of the read-out; that of the settings by default.
+        refine: True to refine the surface; by default as above.
+        output: Folder of the results; ``RUN/reconstruction`` by default.
         accelerator: Device that refines the surface.
         progress: Display of progress.
 

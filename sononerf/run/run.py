@@ -243,7 +243,7 @@ class Run(NotebookRepr):
         self._kept = traced
 
     def _traces_its_mesh(self) -> bool:
-        """Return whether the traced surface is that of the reconstruction."""
+        """Return True if the traced surface is that of the reconstruction."""
         try:
             traced, mesh = self.traced(), self.mesh()
         except InputError:
@@ -265,7 +265,7 @@ class Run(NotebookRepr):
             traced: True also traces echoes off the surface: some seconds for the first pose, then
                 some tenths of a second for each. The field alone takes some hundredths.
             accelerator: Device to render on: ``auto``, ``cpu`` or ``gpu``.
-            progress: Display of progress; on stderr where None.
+            progress: Display of progress; on stderr by default.
 
         Raises:
             InputError: If a pose is too far from the region for anything to be heard.
@@ -314,7 +314,7 @@ class Run(NotebookRepr):
     # Which stages are done.
 
     def is_done(self, stage: StageName) -> bool:
-        """Return whether a stage came to its end, with the results of the stages before it."""
+        """Return True if a stage came to its end, with the results of the stages before it."""
         if stage == "fit":
             return (self.path / DESCRIPTION_NAME).is_file()
         if stage == "surface":

@@ -127,8 +127,8 @@ def simulate(
     Args:
         settings: The experiment.
         scene: Another one than the settings'.
-        output: The store; ``data/<scene>-<hash>`` where None.
-        workers: Processes; as many as there are cores, at most 8, where None.
+        output: The store; ``data/<scene>-<hash>`` by default.
+        workers: Processes; as many as there are cores, at most 8, by default.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Display of progress.
 

@@ -343,7 +343,7 @@ class Part:
         position ((3,), m): Place of its origin.
         rotation (3, 3): From its own frame to the world's.
         scale (1): Above 0, at most 1000.
-        material: For all of it; its own where None.
+        material: For all of it; its own by default.
         background: Whether all of it is surroundings and not the target.
         name: For messages; may be empty.
     """

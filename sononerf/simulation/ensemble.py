@@ -67,17 +67,17 @@ def simulate(
     Args:
         scene: The ensonified scene.
         poses: Poses of the head, P of them.
-        head: The head; the default head where None.
+        head: The head; the default head by default.
         split (P,): Use of each pose: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2. Where
             None, a twentieth of the poses validates and a tenth is held out (10 and 20 at most),
             drawn at random with seed 0.
-        output: Folder of the store. The echoes are kept in memory where None.
+        output: Folder of the store. The echoes are kept in memory by default.
         options: Engine, accuracy and seed: keys of the section ``simulation`` of the settings, such
             as ``{"accuracy_db": 0.4, "bounces": 1, "seed": 1}``.
         about: Further attributes of the ensemble, plain data.
-        workers: Processes; as many as there are cores, at most 8, where None.
+        workers: Processes; as many as there are cores, at most 8, by default.
         scheduler: Address of a Dask scheduler to use instead.
-        progress: Display of progress; on stderr where None.
+        progress: Display of progress; on stderr by default.
 
     Returns:
         echoes: Complete.

@@ -56,7 +56,7 @@ class Audibility:
     bounces: int  # Largest number of hits of a ray
 
     def judge(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
-        """Return which hits some listener can hear (H,), and the possible error of each (H,)."""
+        """Return the mask (H,) of audible hits, and the possible error of each (H,)."""
         count = len(bounce.ray)
         audible, doubt = np.zeros(count, dtype=np.bool_), np.zeros(count)
         # Sound that continues from here may be heard, whatever the view from the head.

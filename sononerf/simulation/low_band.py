@@ -99,7 +99,7 @@ class Equations:
         )
 
     def error(self, incident: NDArray[np.complex64], strength: NDArray[np.complex64]) -> float:
-        """Return what is left of the normal slope at the points that were left out, relative."""
+        """Return the relative error of the normal slope at the points that were left out."""
         arriving = incident[self._asked :]
         left = self._checks @ strength + arriving
         return float(np.linalg.norm(left) / np.linalg.norm(arriving))
@@ -359,7 +359,7 @@ class LowBand:
         return float(np.mean(INSIDE * self.surface[2] < SHALLOWEST * spacing))
 
     def sources(self, frequency: float) -> int:
-        """Return how many sources are used at a frequency in Hz, on a few levels."""
+        """Return the number of sources at a frequency, Hz, on a few levels."""
         wanted = np.square(frequency / self.frequency_max)
         level = (
             math.ceil(max(wanted - FEWEST_SOURCES, 0.0) / (1.0 - FEWEST_SOURCES) * LEVELS) / LEVELS
@@ -499,7 +499,7 @@ def resolved_frequency(scene: Scene, sources: int, *, speed_of_sound: float) -> 
 
 
 def sources_worth(scene: Scene) -> int:
-    r"""Return how many sources reach the frequency above which rays are as good.
+    r"""Return the number of sources that reach the frequency above which rays are as good.
 
     A sphere of radius a has the area :math:`4 \pi a^2`; for a body that is none, a is what its
     area says.

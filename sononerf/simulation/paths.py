@@ -47,7 +47,7 @@ class Reflection:
     material: Material  # Material of these values
 
     def curved_share(self, curvature: Floats) -> Floats:
-        """Return how curved places are, 0 to 1, by their total curvature (N,) in 1/m."""
+        """Return the curvature of places, 0 to 1, from their total curvature (N,) in 1/m."""
         steepness = 8.0 * self.material.transition_slope
         away = steepness * (curvature - self.material.transition_curvature)
         return 0.5 * (1.0 + np.tanh(0.5 * away))

@@ -250,7 +250,7 @@ class Rays:
         )
 
     def _reaching(self, cap: CapSpiral, emitter: Floats) -> Ints:
-        """Return which rays of a cap may hit the scene."""
+        """Return the indices of the rays of a cap that may hit the scene."""
         centres, radii = self._balls
         offsets = centres - emitter
         distance = np.linalg.norm(offsets, axis=1)
@@ -342,7 +342,7 @@ class Rays:
     def _heard(
         self, bounce: Bounce, ear: Floats, lit: Shadow | None = None, shadow: Shadow | None = None
     ) -> tuple[Ints, NDArray[np.floating[Any]], Singles, tuple[Ints, NDArray[np.complex64]] | None]:
-        """Return which hits an ear hears (N,), their gain (N, F), and their paths' spread (N,), m.
+        """Return the hits (N,) that an ear hears, their gain (N, F), and the spread of paths (N,), m.
 
         The last two are the shaded hits (M,) and the transmitted fraction (M, F), or None.
         """
@@ -367,7 +367,7 @@ class Rays:
     def _shaded(
         self, bounce: Bounce, near: Ints, seen: Bools, lit: Shadow | None, shadow: Shadow | None
     ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
-        """Return which hits pass obstacles, and the transmission of those near an outline."""
+        """Return the hits that pass obstacles, and the transmission of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         if lit is None or shadow is None:
             return seen, None

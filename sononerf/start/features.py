@@ -51,7 +51,7 @@ def pooled(
     spacing: float,
     resolution: float,
 ) -> tuple[Singles, Singles, Singles]:
-    """Return what all pose-ear pairs say about places.
+    """Return the pooled quantities of all pose-ear pairs at places.
 
     A pair hears a place with the level h over the usual one, spreading removed, at the distance c
     behind the pair's onset. Its quantities are, in this order: seven linear bins of h from -36 to 0
@@ -192,7 +192,7 @@ def halved(lattice: Lattice) -> Lattice:
 
 
 def free_places(hull: EchoHull, lattice: Lattice) -> Bools:
-    """Return which places of the halved lattice lie well in front of the onsets, (X, Y, Z)."""
+    """Return the mask (X, Y, Z) of the places of the halved lattice well in front of the onsets."""
     return np.asarray(clearance_grid(hull, halved(lattice)) < -DENSE_DISTANCE * 4 * lattice.spacing)
 
 

@@ -187,7 +187,7 @@ def predicted_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) ->
 
 
 def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, ...]) -> Singles:
-    """Return what the network makes of features in a turned or mirrored frame, turned back."""
+    """Return the network's output for a rotated or mirrored frame, in the original frame."""
     seen, bound = places.in_frame(order, signs)
     with torch.no_grad():
         made = _network()(torch.from_numpy(seen)[None], torch.from_numpy(bound)[None])

@@ -154,7 +154,7 @@ def _framed(gathered: Gathered) -> _Frame:
 
 
 def _hull_heights(frame: _Frame) -> tuple[Bools, Floats, Floats]:
-    """Return which columns the hull fills, with the lower and upper end, (U V,) each, m."""
+    """Return the columns that the hull fills, with the lower and upper end, (U V,) each, m."""
     inside = frame.depth > 0
     first = frame.heights[inside.argmax(axis=2)]
     last = frame.heights[::-1][inside[:, :, ::-1].argmax(axis=2)]
@@ -263,7 +263,7 @@ def read_field(
 
 
 def read_echoes(echoes: Echoes) -> Reading:
-    """Return what start surfaces are made of where there is no field."""
+    """Return the data of start surfaces without a field."""
     box = echoes.region.box() if echoes.box is None else echoes.box
     return Reading(echoes.hull, box, echoes.head.resolution, echoes.levels, methods=LEVELS)
 

@@ -82,7 +82,7 @@ def _carry(mesh: trimesh.Trimesh, file_type: MeshFormat, poses: NDArray[Any]) ->
 
 
 def confidence_of(mesh: trimesh.Trimesh) -> NDArray[np.int32] | None:
-    """Return how many poses heard each vertex (V,) of a mesh that was read from a PLY file.
+    """Return the number of poses that heard each vertex (V,) of a mesh from a PLY file.
 
     None where the file does not say.
     """
@@ -313,7 +313,7 @@ class Openness:
 def judge_openness(
     mesh: trimesh.Trimesh, sources: Floats, *, resolution: float, plane: Plane | None = None
 ) -> Openness:
-    """Return whether a surface is a closed body, one-sided or a sheet.
+    """Judge whether a surface is a closed body, one-sided, or a sheet.
 
     A support mirrors sound, so that poses also hear from their images. A triangle that stands on
     the support counts as seen: no pose hears it, but the support gives its place.
@@ -363,7 +363,7 @@ def _seen(caster: RayCaster, middles: Floats, normals: Floats, sources: Floats) 
 def known_part(
     mesh: trimesh.Trimesh, heard: NDArray[np.int32], hull: EchoHull, *, resolution: float
 ) -> Bools:
-    """Return which triangles of a surface that was heard from one side are known.
+    """Return the mask of the triangles that were heard, of a surface heard from one side.
 
     These are the triangles that two poses heard. A triangle between such triangles is also known if
     it lies within one range resolution behind an onset. Between means in their convex hull, or as
@@ -388,7 +388,7 @@ def known_part(
 
 
 def at_wall(points: Floats, box: Floats, voxel: float) -> Bools:
-    """Return which points (N, 3), m, lie within a voxel of the region's walls, or beyond, (N,)."""
+    """Return the mask (N,) of points (N, 3), m, within a voxel of the region's walls, or beyond."""
     inner = (points > box[0] + voxel) & (points < box[1] - voxel)
     return np.asarray(~inner.all(axis=1))
 
