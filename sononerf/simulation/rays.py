@@ -342,7 +342,7 @@ class Rays:
     def _heard(
         self, bounce: Bounce, ear: Floats, lit: Shadow | None = None, shadow: Shadow | None = None
     ) -> tuple[Ints, NDArray[np.floating[Any]], Singles, tuple[Ints, NDArray[np.complex64]] | None]:
-        """Return the hits (N,) that an ear hears, their gain (N, F), and the spread of paths (N,), m.
+        """Return the hits (N,) of an ear, their gain (N, F), and the spread of their paths (N,), m.
 
         The last two are the shaded hits (M,) and the transmitted fraction (M, F), or None.
         """
