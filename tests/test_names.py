@@ -12,7 +12,6 @@ import trimesh
 
 import sononerf
 from sononerf.errors import InputError, SettingsError
-from sononerf.scene.material import MATERIALS
 
 
 def test_all_names_are_there_and_have_docstrings():
@@ -34,12 +33,16 @@ def test_an_import_of_the_package_imports_nothing_else():
     assert done.stdout == "[]\nFalse\n", done.stderr
 
 
-def test_a_scene_from_a_file(tmp_path):
+def test_a_scene_of_a_file_has_its_unit_and_material(tmp_path):
     trimesh.creation.box((10.0, 20.0, 30.0)).export(tmp_path / "box.stl")
     scene = sononerf.Scene.load(tmp_path / "box.stl", unit="mm", material="leaf")
     np.testing.assert_allclose(scene.mesh.extents, (0.01, 0.02, 0.03))
-    assert scene.material == MATERIALS["leaf"]
     with pytest.raises(InputError, match="states no unit"):
         sononerf.Scene.load(tmp_path / "box.stl")
     with pytest.raises(SettingsError, match="unknown"):
         sononerf.Scene.load(tmp_path / "box.stl", unit="mm", colour="red")
+
+
+def test_a_section_of_the_head_that_has_another_name_is_told():
+    with pytest.raises(SettingsError, match=r"unknown section 'analysis'.*spectrogram \(once"):
+        sononerf.Head(analysis={"window": 64})

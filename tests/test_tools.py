@@ -161,12 +161,6 @@ def test_the_table_shows_starts_candidates_and_result_and_what_a_right_choice_wo
     assert [line[:2] for line in lines if line[1] == "calls"] == [["400", "calls"], ["25", "calls"]]
 
 
-def test_a_folder_without_a_mesh_is_refused(tmp_path):
-    given = argparse.Namespace(foreign=tmp_path, output=tmp_path / "out", calls=[25], set=[])
-    with pytest.raises(SystemExit, match=r"holds no mesh \(\.ply"):
-        foreign.foreign(given, tmp_path / "out")
-
-
 def test_of_each_start_the_surface_with_the_lowest_objective_counts():
     def stage(objective, height):
         corners = torch.tensor([[0.0, 0, height], [1, 0, height], [0, 1, height]])

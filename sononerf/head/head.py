@@ -165,8 +165,8 @@ class Head(NotebookRepr):
         **unknown: object,
     ) -> None:
         if unknown:
-            fault = f"Head has no section {next(iter(unknown))!r}; the filters are spectrogram="
-            raise SettingsError(f"{fault} (analysis= before 0.2.0)")
+            listed = ", ".join(SECTIONS).replace("spectrogram", "spectrogram (once analysis)")
+            raise SettingsError(f"Head: unknown section {next(iter(unknown))!r}; known: {listed}")
         for name, kind, given in (
             ("ears", EarSettings, ears),
             ("call", CallSettings, call),
