@@ -187,7 +187,7 @@ def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Te
         pieces, heads, _ = surface.listen(echoes.positions[some], echoes.rotations[some])
         near = pieces.reach.amax(1) > MIN_SUPPORT
         pose = pieces.pose[near] % heads.poses
-        # On a support a pose may see a vertex in several ways.
+        # On a support a pose may see a vertex by several paths.
         vertex = torch.unique(pieces.vertex[near] * heads.poses + pose) // heads.poses
         count.index_add_(0, vertex, torch.ones_like(vertex, dtype=count.dtype))
     return count
@@ -258,7 +258,7 @@ Blur removes dents and necks, but also edges, sheets and wires."""
 
 CHANCE_RATIO = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
-a sheet goes on after the first stage, or else one way before another. A refined surface is
+a sheet goes on after the first stage, or else the preferred schedule. A refined surface is
 preferred to its start within it: a start that was made from the onsets fits them even where it is
 wrong."""
 RANKS_DB = 4.0
@@ -269,14 +269,14 @@ candidate wins against one that is not closed. Within ``CHANCE_RATIO``, ``levels
 the other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
 earliest one within ``CHANCE_RATIO`` of the best is kept."""
 SAME_SURFACE_DISTANCE = 1 / 16
-"""Mean distance below which two surfaces sound alike, shortest wavelengths: the way there and back
+"""Mean distance below which two surfaces sound alike, shortest wavelengths: the path there and back
 counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
 LATER_STAGE_RATIO = 1.03
 """Ratio of two objectives of one candidate below which the later stage is preferred: on smooth
 bodies later stages are nearer to the truth at the same objective. Edges lose in later stages, and
 there the objective rises by 5 % and more (beaker, star)."""
 Schedule = Literal["blurred", "sharp", "sheet", "planes"]
-"""Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
+"""How a surface goes through the stages. ``blurred``: with the blur and the edges of each stage,
 unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``sheet``:
 its triangles are kept, because a signed distance on voxels would tear it. ``planes``: its flat
 parts move as planes, and are found anew in each stage."""
@@ -284,9 +284,9 @@ parts move as planes, and are found anew in each stage."""
 
 @dataclass(eq=False)
 class Candidate:
-    """A start that goes through the stages in one way."""
+    """A start that goes through the stages by one schedule."""
 
-    schedule: Schedule  # The way
+    schedule: Schedule
     start: StartMethod  # Name of the start
     level: ErrorLevel  # Its gains and errors
     meshes: list[trimesh.Trimesh]  # The start, and the surface after each stage so far, m
@@ -341,7 +341,7 @@ def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def planned(
     starts: Mapping[StartMethod, float], *, flat: bool = False
 ) -> list[tuple[StartMethod, Schedule]]:
-    """Return the start and the way of each candidate."""
+    """Return the start and the schedule of each candidate."""
     others = [name for name in starts if name not in (*LEVELS, "sheet")]
     chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
     chosen += sorted(others, key=lambda name: starts[name])[:1]
@@ -378,7 +378,7 @@ def after_first_stage(
 
     A sheet that is about as good as the best one goes on alone. Of planes and the best of the
     others the better one goes on, in doubt both; only their errors count, because free surfaces
-    follow the onsets and planes do not. Else each start goes on in its better way, ``levels`` and
+    follow the onsets and planes do not. Else each start goes on by its better schedule, ``levels`` and
     ``fuller`` as one, but none that is clearly worse.
     """
     good = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
@@ -404,7 +404,7 @@ def after_first_stage(
 
 
 def _better(candidates: list[Candidate]) -> Candidate:
-    """Return the way that explains the echoes best, of one start or of both by the network.
+    """Return the candidate that explains the echoes best, of one start or both of the network.
 
     In doubt, a sharp one by the network, whose surfaces are smooth, so that blur wears edges and
     strokes away; of these a fuller one, because gaps stay and what is too thick becomes thinner.

@@ -68,7 +68,7 @@ class Refined:
     kept: bool
     # Objective on validation poses, see :class:`~sononerf.refinement.objective.Comparison`
     error_db: float
-    # Per stage: its number, start, way, last mismatch, and objective after it
+    # Per stage: its number, start, schedule, last mismatch, and objective after it
     history: list[dict[str, Any]]
     # Faults of the refinement, one line each: a surface that could not be traced and counted as the
     # worst, or a stage that went without the simulator's correction
