@@ -378,8 +378,8 @@ def after_first_stage(
 
     A sheet that is about as good as the best one goes on alone. Of planes and the best of the
     others the better one goes on, in doubt both; only their errors count, because free surfaces
-    follow the onsets and planes do not. Else each start goes on by its better schedule, ``levels`` and
-    ``fuller`` as one, but none that is clearly worse.
+    follow the onsets and planes do not. Else each start goes on by its better schedule, ``levels``
+    and ``fuller`` as one, but none that is clearly worse.
     """
     good = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.schedule == "sheet"]
