@@ -367,7 +367,7 @@ def write_import(
     echoes_id = import_hash(plan)
     if (output / "zarr.json").is_file():
         store = EnsembleStore.open(output)
-        if store.attributes.get("import_hash") != echoes_id:
+        if store.attributes.get("echo_hash") != echoes_id:
             raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
         if store.is_sealed and not store.damaged():
             return store, verdict(plan, store)
@@ -401,7 +401,7 @@ def write_import(
 def _attributes(plan: ImportPlan, echoes_id: str) -> dict[str, Any]:
     plain = plan.settings.plain()
     return {
-        "import_hash": echoes_id,
+        "echo_hash": echoes_id,
         "origin": "recorded",
         "format": plan.form,
         "source": plan.options.source or plan.recording.path.name,

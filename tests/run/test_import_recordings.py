@@ -55,6 +55,7 @@ def test_a_store_knows_all_that_a_fit_needs(brought):
     assert Echoes.open(store.path).head.plane is None
     assert known["settings"]["spectrogram"]["sampling_rate"] == 250e3
     assert known["settings"]["call"]["kind"] == "linear"
+    assert (known["origin"], len(known["echo_hash"])) == ("recorded", 64)
     assert known["speed_of_sound"] == 343.0
     assert known["noise_floor_of"] == "noise before the first echoes"
     assert known["noise_floor_mae_db"] < 0.02  # the rounding of a recording without noise
