@@ -147,7 +147,8 @@ def ending(output: Path) -> Iterator[None]:
 
 def origin() -> dict[str, str]:
     """Return what a table was made with."""
-    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    cores, threads = os.cpu_count(), torch.get_num_threads()
+    machine = f"{platform.system()} {platform.machine()}, {cores} cores, {threads} threads"
     command = ["git", "describe", "--always", "--dirty"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     return {"sononerf": __version__, "commit": done.stdout.strip(), "machine": machine}

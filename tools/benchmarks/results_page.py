@@ -19,11 +19,11 @@ MARKS = ("<!-- numbers -->", "<!-- end of the numbers -->")
 BOTH = ("three_spheres", "ua")
 HEAD = """# Results
 
-Written by `python tools/benchmark.py surfaces --page`{origin}.
-Default settings, seed 0 of poses and fit, 400 training poses where no other number is named, and 20
-held-out poses that were drawn apart and never trained on. The echoes come from our own simulator.
-Decibels, active cells and scores are explained in the README. Other work ran on
-the machine, so times are upper limits.
+Written by `python tools/benchmark.py surfaces --page`
+from runs of commit {commit} ({machine}, no GPU). Default settings, seed 0 of
+poses and fit, 400 training poses where no other number is named, and 20 held-out poses that were
+drawn apart and never trained on. The echoes come from our own simulator. Decibels, active cells and
+scores are explained in the README; how long it takes is in [performance.md](performance.md).
 
 What was measured at other commits (few calls, real recordings, exact echoes, receivers and bands,
 self-calibration, errors of vertices, next poses, earlier versions) is in
@@ -64,7 +64,7 @@ def write_page(output: Path) -> str:
     if len(commits) > 1:
         raise SystemExit(f"error: {output}: rows of several commits ({', '.join(commits)})")
     machine = (own or foreign)[0]["machine"]
-    text = HEAD.format(origin=f" from runs of commit {commits[0]} ({machine}, no GPU)")
+    text = HEAD.format(commit=commits[0], machine=machine)
     if foreign:
         text += FOREIGN.format(count=len(foreign)) + _foreign_tables(foreign)
     if own:
@@ -91,7 +91,8 @@ def _foreign_tables(rows: Sequence[Row]) -> str:
     def spread(of: Callable[[Row], float | None]) -> str:
         scores = [score for row in rows if (score := of(row)) is not None]
         middle, least, mean = statistics.median(scores), min(scores), statistics.fmean(scores)
-        return f"{middle:.2f} · {least:.2f} · {mean:.2f}"
+        some = "" if len(scores) == len(rows) else f" (of {len(scores)})"
+        return f"{middle:.2f} · {least:.2f} · {mean:.2f}{some}"
 
     def start(name: str) -> Callable[[Row], float | None]:
         return lambda row: row["starts"].get(name, {}).get("fscore_2mm")
@@ -104,7 +105,7 @@ def _foreign_tables(rows: Sequence[Row]) -> str:
     ]
     chamfer = 1e3 * statistics.median(row["result"]["chamfer_m"] for row in rows)
     five = statistics.median(row["result"]["fscore_5mm"] for row in rows)
-    bodies = [["number", "start `levels`", "F 2 mm", "Chamfer", "parts (true)", "chosen", "time"]]
+    bodies = [["number", "start `levels`", "F 2 mm", "Chamfer", "parts (true)", "chosen"]]
     for row in sorted(rows, key=lambda row: str(row["name"])):
         result = row["result"]
         bodies.append(
@@ -115,7 +116,6 @@ def _foreign_tables(rows: Sequence[Row]) -> str:
                 f"{1e3 * result['chamfer_m']:.2f} mm",
                 f"{result['parts']} ({result['parts_true']})",
                 f"`{row['chosen']}`" + ("" if row["kept"] else ", unrefined"),
-                f"{row['fit_s'] + row['surface_s']:.0f} s",
             ]
         )
     said = f"\nMedian Chamfer distance {chamfer:.2f} mm, median F-score at 5 mm {five:.2f}. "
@@ -123,7 +123,7 @@ def _foreign_tables(rows: Sequence[Row]) -> str:
 
 
 def _own_table(rows: Sequence[Row]) -> str:
-    lines = [["", "Chamfer", "F 1 · 2 · 5 mm", "parts (true)", "field alone", "all", "time"]]
+    lines = [["", "Chamfer", "F 1 · 2 · 5 mm", "parts (true)", "field alone", "all"]]
     for row in rows:
         scores = " · ".join(f"{row[f'fscore_{mm}mm']:.2f}" for mm in (1, 2, 5))
         lines.append(
@@ -134,11 +134,10 @@ def _own_table(rows: Sequence[Row]) -> str:
                 f"{row['parts']} ({row['parts_true']})",
                 f"{row['rendered_mae_db_active']:.2f} dB",
                 f"{row['heldout_mae_db']:.2f} · {row['heldout_mae_db_active']:.2f} dB",
-                f"{row['seconds']:.0f} s",
             ]
         )
-    said = "*Field alone*: active cells. *All*: with traced echoes, all · active cells. "
-    return f"\n{said}*Time*: fit and surface.\n\n{_table(lines)}"
+    said = "*Field alone*: active cells. *All*: with traced echoes, all · active cells."
+    return f"\n{said}\n\n{_table(lines)}"
 
 
 def _both(runs: Mapping[str, Mapping[str, Any]]) -> str:
@@ -168,10 +167,6 @@ def _both(runs: Mapping[str, Mapping[str, Any]]) -> str:
         part = metrics["prediction"]
         return f"{part['rendered_mae_db']:.2f} · {part['rendered_mae_db_active']:.2f} dB"
 
-    def times(metrics: Mapping[str, Any]) -> str:
-        names = ("simulate_s", "fit_s", "reconstruct_s")
-        return " · ".join(f"{metrics['cost'][name]:.0f} s" for name in names)
-
     lines = [
         ["", *runs],
         row("the field's rendering alone, held-out, all · active cells", rendered),
@@ -196,6 +191,5 @@ def _both(runs: Mapping[str, Mapping[str, Any]]) -> str:
             "parts (true)",
             lambda m: f"{m['geometry']['components']} ({m['geometry']['components_true']})",
         ),
-        row("echoes · fit · surface with its files and pictures", times),
     ]
     return _table(lines)
