@@ -28,6 +28,9 @@ AVERAGING_WIDTH = 1.6
 """Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. With
 1.3 the points of nineteen touching spheres lie 0.9 mm too far out, with 2.0 0.3 mm; but with 2.0
 two spheres that stand close are joined."""
+MAX_PAIRS = 1e8
+"""Pairs of neighbouring places, at most, over which the sound is averaged: 5 GB of memory. Three
+spheres have 1e6. Of more places a random part is taken."""
 COMPRESSION = 0.25
 """Exponent of the power in the weight of a point: quiet parts must count beside loud ones."""
 _FAINTEST = 1e-4  # fraction of a pose's greatest power; quieter sound is left out, to save time
@@ -66,6 +69,8 @@ def locate_sound(
     """
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
+    kept = _bounded(where, AVERAGING_WIDTH * resolution)
+    places, where = places[torch.as_tensor(kept, device=places.device)], where[kept]
     kernel = _neighbours(where, AVERAGING_WIDTH * resolution)
     parts: list[tuple[Floats, Floats, Floats, NDArray[np.intp]]] = []
     for pose, source in enumerate(sources):
@@ -97,6 +102,14 @@ def locate_sound(
     usual = float(np.median([f[2].max() for f in parts]))
     weight = np.minimum(power_ / usual, 1.0) ** COMPRESSION
     return Evidence(points, normals, weight, pose_)
+
+
+def _bounded(places: Floats, deviation: float) -> Ints:
+    """Return the places whose pairs of neighbours fit into memory: all, or a random part."""
+    tree = cKDTree(places)
+    pairs = float(tree.count_neighbors(tree, _CUTOFF * deviation))
+    count = int(len(places) * min(1.0, np.sqrt(MAX_PAIRS / max(pairs, 1.0))))
+    return np.sort(np.random.default_rng(0).choice(len(places), count, replace=False))
 
 
 def _neighbours(places: Floats, deviation: float) -> sparse.csr_matrix:

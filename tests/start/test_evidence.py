@@ -8,6 +8,7 @@ import torch
 from sononerf.echoes.free_space import EchoHull
 from sononerf.field.field import Field, sphere_directions
 from sononerf.geometry.lattice import Lattice
+from sononerf.start import evidence as module
 from sononerf.start.evidence import (
     AT_ONSET,
     COMPRESSION,
@@ -65,6 +66,18 @@ def test_sound_is_put_on_the_surface_facing_its_pose():
     best = found.weight > 0.8
     off = np.linalg.norm(found.points[best], axis=1) - RADIUS
     assert np.abs(off).max() < 0.4e-3
+
+
+def test_of_more_places_than_memory_holds_a_part_says_the_same(monkeypatch):
+    class Counted(Ball):
+        def audible(self, positions, sources, code=None):
+            assert len(positions) < 600  # of 3000
+            return super().audible(positions, sources, code)
+
+    monkeypatch.setattr(module, "MAX_PAIRS", 1e5)
+    few = located(Counted())
+    best = few.weight > 0.8
+    assert np.abs(np.linalg.norm(few.points[best], axis=1) - RADIUS).max() < 1e-3
 
 
 def test_places_that_scatter_in_range_share_one_echo():
