@@ -13,7 +13,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-SHORT = ("poses.count=20", "fit.epochs=1", "fit.steps_per_epoch=20", "reconstruction.refine=false")
+SHORT = (
+    *("poses.count=20", "fit.epochs=1", "fit.steps_per_epoch=20"),
+    *("reconstruction.method=levels", "reconstruction.refine=false"),  # needs the network's weights
+)
 
 
 @pytest.mark.slow  # a minute each

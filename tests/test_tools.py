@@ -21,6 +21,7 @@ from sononerf.start.features import FEATURES
 from sononerf.start.network import StartNetwork
 from tools.benchmarks import exact, foreign
 from tools.benchmarks.experiment import CONFIG
+from tools.benchmarks.results_page import write_page
 from tools.benchmarks.step import PAIRS
 from tools.benchmarks.surfaces import CASES, chosen_cases, measured, table
 from tools.learning.bodies import KINDS, body
@@ -79,6 +80,14 @@ def test_a_line_tells_of_surface_prediction_and_time():
     # Whatever stage comes between fit and surface counts.
     more = {"cost": {"fit_s": 1.0, "refine_s": 20.0, "reconstruct_s": 300.0, "simulate_s": 4000.0}}
     assert measured(more)["seconds"] == 321.0
+
+
+REFINED = {
+    "starts": {"levels": {"fscore_2mm": 0.5}},
+    "result": {"fscore_2mm": 0.8, "fscore_5mm": 1, "chamfer_m": 1e-3, "parts": 1, "parts_true": 2},
+    "chosen": "levels",
+    "kept": False,
+}
 
 
 def rows():
@@ -159,6 +168,23 @@ def test_the_table_shows_starts_candidates_and_result_and_what_a_right_choice_wo
     assert least[:3] == ["least", "0.60", "0.50"]
     assert [line[0] for line in lines].count("c") == 1
     assert [line[:2] for line in lines if line[1] == "calls"] == [["400", "calls"], ["25", "calls"]]
+
+
+def test_the_page_has_one_commit_and_one_number_of_calls(tmp_path):
+    other = {"name": "randoma", "calls": 400, "commit": "abc", "machine": "m", **REFINED}
+    lines = [other, {**other, "name": "randomb", "calls": 25}]
+    text = "\n".join(json.dumps(line) for line in lines)
+    (tmp_path / "foreign.jsonl").write_text(text)
+    page, readme = tmp_path / "results.md", tmp_path / "README.md"
+    write_page(tmp_path, page, readme)
+    assert "commit abc" in page.read_text()
+    assert "1 closed bodies" in page.read_text()
+    assert "| a | 0.50 | 0.80 | 1.00 mm | 1 (2) | `levels`, unrefined |" in page.read_text()
+    (tmp_path / "foreign.jsonl").write_text(
+        f"{text}\n{json.dumps({**other, 'commit': 'd', 'name': 'c'})}"
+    )
+    with pytest.raises(SystemExit, match=r"rows of several commits \(abc, d\)"):
+        write_page(tmp_path, page, readme)
 
 
 def test_of_each_start_the_surface_with_the_lowest_objective_counts():

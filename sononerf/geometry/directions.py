@@ -193,7 +193,7 @@ def _on_sphere(share: Floats, turn: Floats, depth: float, axes: Floats) -> Float
 
 @compiled
 def _in_patches(chosen: Bools, count: int, shift: float, turn: float) -> Ints:
-    """Return the directions of a spiral in chosen patches (rows, columns), ascending."""
+    """Return the indices of the directions in chosen patches (rows, columns), ascending."""
     rows, columns = chosen.shape
     index, count_inside = np.zeros(count, np.int64), 0
     for i in range(count):

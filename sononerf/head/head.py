@@ -165,7 +165,9 @@ class Head(NotebookRepr):
         **unknown: object,
     ) -> None:
         if unknown:
-            listed = ", ".join(SECTIONS).replace("spectrogram", "spectrogram (once analysis)")
+            listed = ", ".join(SECTIONS).replace(
+                "spectrogram", "spectrogram (analysis before 0.2.0)"
+            )
             raise SettingsError(f"Head: unknown section {next(iter(unknown))!r}; known: {listed}")
         for name, kind, given in (
             ("ears", EarSettings, ears),

@@ -59,7 +59,8 @@ MOST_CHANNELS = 8
 RANGE_FACTORS = tuple(float(f) for f in np.exp(np.linspace(-0.6, 0.6, 13)) if abs(f - 1.0) > 0.01)
 """Factors of all ranges, 10 % apart: those of a wrong sampling rate or speed of sound."""
 MIN_SCALE_GAIN = 0.5
-"""MIN_GAIN_PER_PING for such a factor: of 120 sound sets two gained 0.3, and the others less."""
+"""Least gain in log-likelihood per ping for such a factor to be named. Of 120 sound sets two gained
+0.3, and the others less."""
 RANDOM_ORDERS = 4
 """Number of random orders that the stated order of the poses is compared with."""
 XYZW = (QUATERNION[-1], *QUATERNION[:-1])
@@ -340,7 +341,7 @@ def _length(metres: float) -> str:
 
 
 def _late(poses: Poses, prediction: RangePrediction, resolution: float) -> Verdict:
-    """Return True if the ranges are too long for any body amid the poses."""
+    """Return a verdict if the ranges are too long for any body amid the poses."""
     away = poses.positions - prediction.centre
     distance = np.linalg.norm(away, axis=1)
     direction = away / np.maximum(distance, 1e-12)[:, None]

@@ -439,7 +439,7 @@ def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], 
 
 
 def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:
-    """Return True if a surface encloses a body, as far as the poses of a hull can have heard it."""
+    """Return a test of surfaces: do they enclose a body, as far as the poses of a hull can hear?"""
 
     def is_closed(mesh: trimesh.Trimesh) -> bool:
         found = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)

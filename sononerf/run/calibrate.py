@@ -138,7 +138,7 @@ CONVERGED = 0.1
 MAX_LENGTH_ERROR = 0.25
 """Largest uncertainty of a length, range resolutions, at which an error counts as found."""
 MAX_GAIN_ERROR_DB = 1.0
-"""MAX_LENGTH_ERROR of a gain, dB."""
+"""Largest uncertainty of a gain, dB, at which it counts as found."""
 MAX_HEIGHT_ERROR = 1.0
 """Largest uncertainty of the support's height, range resolutions, at which it counts as found."""
 ON_CYLINDER = 0.02

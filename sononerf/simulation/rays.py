@@ -367,7 +367,7 @@ class Rays:
     def _shaded(
         self, bounce: Bounce, near: Ints, seen: Bools, lit: Shadow | None, shadow: Shadow | None
     ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
-        """Return the hits that pass obstacles, and the transmission of those near an outline."""
+        """Return the mask of hits that pass obstacles, and the transmission near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         if lit is None or shadow is None:
             return seen, None

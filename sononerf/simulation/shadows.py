@@ -379,7 +379,7 @@ def _product(real: Floats, factor: Complexes) -> Complexes:
 def behind(
     caster: RayCaster, outlines: Outlines, hits: Hits, directions: Floats
 ) -> tuple[Hits, Floats]:
-    """Return the hits of rays beyond the first obstacle, and the whole ways (M,) there, m."""
+    """Return the hits of rays beyond the first obstacle, and the whole paths (M,) there, m."""
     ray, points, length = hits.ray, hits.points, hits.distance
     parts: list[tuple[Hits, Floats]] = []
     for _ in range(LAYERS):

@@ -17,6 +17,8 @@ PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
 MARKS = ("<!-- numbers -->", "<!-- end of the numbers -->")
 """Lines of the README between which its table stands."""
 BOTH = ("three_spheres", "ua")
+CALLS = 400
+"""Calls of the bodies of others that are on the page."""
 HEAD = """# Results
 
 Written by `python tools/benchmark.py surfaces --page`
@@ -40,7 +42,7 @@ network. Several versions were measured on these bodies, and the rule by which p
 surfaces are compared was chosen with a look at them, so the figures are a little too good.
 
 ```sh
-python tools/benchmark.py surfaces --foreign FOLDER --calls 400
+python tools/benchmark.py surfaces --foreign FOLDER --calls {calls}
 ```
 """
 OWN = """
@@ -54,10 +56,11 @@ python tools/benchmark.py surfaces --seeds 0 --only {names}
 """
 
 
-def write_page(output: Path) -> str:
-    """Write `docs/results.md` and the README's table from the rows and runs in a folder."""
+def write_page(output: Path, page: Path = PAGE, readme: Path = README) -> str:
+    """Write the page and the README's table from the rows and runs in a folder."""
     own = [row for row in rows_of(output / "surfaces.jsonl") if "failed" not in row]
-    foreign = rows_of(output / "foreign.jsonl")
+    own = [row for row in own if row["seed"] == 0]
+    foreign = [row for row in rows_of(output / "foreign.jsonl") if row["calls"] == CALLS]
     commits = sorted({row["commit"] for row in (*own, *foreign)})
     if not commits:
         raise SystemExit(f"error: {output}: holds no finished rows (surfaces.jsonl, foreign.jsonl)")
@@ -66,7 +69,7 @@ def write_page(output: Path) -> str:
     machine = (own or foreign)[0]["machine"]
     text = HEAD.format(commit=commits[0], machine=machine)
     if foreign:
-        text += FOREIGN.format(count=len(foreign)) + _foreign_tables(foreign)
+        text += FOREIGN.format(count=len(foreign), calls=CALLS) + _foreign_tables(foreign)
     if own:
         text += OWN.format(names=" ".join(row["name"] for row in own)) + _own_table(own)
     runs = {name: output / f"{name}-0" / "metrics.json" for name in BOTH}
@@ -74,12 +77,11 @@ def write_page(output: Path) -> str:
         metrics = {name: json.loads(file.read_text("utf-8")) for name, file in runs.items()}
         table = _both(metrics)
         text += "\n## Three spheres and UA\n\n" + table
-        readme = README.read_text(encoding="utf-8")
         inside = f"{MARKS[0]}\n{table}{MARKS[1]}"
-        pattern = f"{MARKS[0]}.*{MARKS[1]}"
-        README.write_text(re.sub(pattern, lambda _: inside, readme, flags=re.DOTALL), "utf-8")
-    PAGE.write_text(text, encoding="utf-8")
-    return f"wrote {PAGE} and {README}"
+        old, pattern = readme.read_text(encoding="utf-8"), f"{MARKS[0]}.*{MARKS[1]}"
+        readme.write_text(re.sub(pattern, lambda _: inside, old, flags=re.DOTALL), "utf-8")
+    page.write_text(text, encoding="utf-8")
+    return f"wrote {page} and {readme}"
 
 
 def _table(lines: Sequence[Sequence[str]]) -> str:
