@@ -38,8 +38,8 @@ FOREIGN = """
 (the random objects in the data of pybullet 3.2.7, every thirtieth from 302 on; turned at random,
 their parts united, 35 to 140 mm large). None of them was used for a training or a constant. Others
 of the program, with numbers up to 292, are 230 of the 540 bodies of the training of the start
-network. Several versions were measured on these bodies, and the rule by which planes and free
-surfaces are compared was chosen with a look at them, so the figures are a little too good.
+network. Several versions were measured on these bodies, and the rule that compares planes with free
+surfaces was chosen with these results in view, so the figures are slightly too good.
 
 ```sh
 python tools/benchmark.py surfaces --foreign FOLDER --calls {calls}
