@@ -258,6 +258,13 @@ class RayCaster:
         along = np.ascontiguousarray(directions)
         return Hits(*_hits_of(hits, start, along, self._planes, self._gradients, self._corners))
 
+    def on_triangles(self, points: Floats, triangle: Ints) -> Hits:
+        """Return the hits of points (N, 3), m, moved onto given triangles (N,)."""
+        along = np.ascontiguousarray(-self.face_normals[triangle])
+        planes, gradients = self._planes, self._gradients
+        points = np.ascontiguousarray(points)
+        return Hits(*_hits_of(triangle, points, along, planes, gradients, self._corners))
+
     def visible(self, points: Floats, targets: Floats, *, normals: Floats | None = None) -> Bools:
         """True where nothing stands between points and targets.
 

@@ -210,7 +210,6 @@ class Tracer:
             engine="rays",
             rays=rays,
             bounces=BOUNCES,
-            diffraction_points=max(rays // 30, 1),  # as many as the simulator's defaults have
         )
         self._simulator = Simulator(Scene(mesh, warns=False), optics.head, options)
         self._nodes, self._seed = _Nodes.of(optics), seed

@@ -186,7 +186,7 @@ def draw_ensemble(settings: Settings, store: Ensemble, folder: Path) -> list[Pat
     simulator = simulator_of(scene, settings)
     pose = store.positions[index], store.rotations[index]
     seed = pose_seed(settings.simulation.seed, index)
-    points, level_db = simulator.hits(*pose, seed=seed)
+    points, level_db = simulator.hits(*pose)
     picture = echo_png(
         scene.mesh,
         points,

@@ -55,7 +55,6 @@ class SimulationSettings(Section):
     accuracy_db: Annotated[float, Field(ge=0.01, le=10)] = 0.2
     rays: Annotated[int, Field(ge=100, le=100_000_000)] | None = None
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
-    diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
     sources: Annotated[int, Field(ge=10, le=20_000)] = 1000
     seed: Seed = 0
     noise_floor_poses: Annotated[int, Field(ge=0)] = 20

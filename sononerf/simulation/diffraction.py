@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -174,28 +174,35 @@ class Edges:
         """Length of each edge (K,), m."""
         return np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
 
+    def __getitem__(self, chosen: Ints) -> Edges:
+        """Return the chosen edges."""
+        return Edges(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
 
 def diffracting_edges(mesh: trimesh.Trimesh) -> Edges:
     """Return the edges of a mesh that are sharper than a crease, and convex or open."""
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+    used, owner = np.asarray(mesh.edges_sorted), np.asarray(mesh.edges_face)
     # A triangle without area, however its corners lie, has no side to diffract on.
-    kept = np.flatnonzero(~_thin(vertices[np.asarray(mesh.faces)]))
-    if len(kept) < len(mesh.faces):
-        mesh = trimesh.Trimesh(vertices, np.asarray(mesh.faces)[kept], process=False)
-    normals = np.asarray(mesh.face_normals, dtype=np.float64)
-    angles = np.asarray(mesh.face_adjacency_angles)
-    sharp = np.flatnonzero((angles >= CREASE) & np.asarray(mesh.face_adjacency_convex))
-    pairs = np.asarray(mesh.face_adjacency)[sharp]
-    used = np.asarray(mesh.edges_sorted)
+    thin = _thin(vertices[faces])
     _, first, count = np.unique(used, axis=0, return_index=True, return_counts=True)
     rim = first[count == 1]
+    rim = rim[~thin[owner[rim]]]
+    kept = np.flatnonzero(~thin)
+    if thin.any():
+        mesh = trimesh.Trimesh(vertices, faces[kept], process=False)
+    normals = np.zeros((len(faces), 3))
+    normals[kept] = mesh.face_normals
+    angles = np.asarray(mesh.face_adjacency_angles)
+    sharp = np.flatnonzero((angles >= CREASE) & np.asarray(mesh.face_adjacency_convex))
+    pairs = kept[np.asarray(mesh.face_adjacency)[sharp]]
     ends = np.concatenate(
         [vertices[np.asarray(mesh.face_adjacency_edges)[sharp]], vertices[used[rim]]]
     )
-    triangle = np.concatenate([pairs[:, 0], np.asarray(mesh.edges_face)[rim]]).astype(np.int64)
+    triangle = np.concatenate([pairs[:, 0], owner[rim]]).astype(np.int64)
     along = ends[:, 1] - ends[:, 0]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    middle = vertices[np.asarray(mesh.faces)[triangle]].mean(axis=1)
+    middle = vertices[faces[triangle]].mean(axis=1)
     inward = middle - ends[:, 0]
     inward -= np.einsum("kd,kd->k", inward, along)[:, None] * along
     inward /= np.linalg.norm(inward, axis=1, keepdims=True)
@@ -208,7 +215,7 @@ def diffracting_edges(mesh: trimesh.Trimesh) -> Edges:
         inward,
         normals[triangle],
         np.concatenate([math.pi + angles[sharp], np.full(len(rim), 2.0 * math.pi)]),
-        kept[triangle],
+        triangle,
     )
 
 
@@ -279,108 +286,145 @@ def wedge_directivity(
     return -0.5 * nu[:, None] * total
 
 
-class Diffraction:
-    r"""Points on edges and strongly curved places; each stands for the same fraction of them.
+EDGE_STEP = 0.25
+"""Length of the stretches of an edge, and distance between the points of strongly curved places,
+over the wavelength at ``RESOLVED_FREQUENCY``; shorter ones change echoes by less than 0.03 dB."""
+INSET = 0.02
+"""Distance from an end of a stretch at which it is asked whether it is seen, over its length: at a
+corner, what meets there would hide it."""
+HALVINGS = 5
+"""Bisections of a stretch that is seen in part; the border is then known to 1/64 of it."""
 
-    The measure is the turn of the surface: for an edge its length times the angle between
-    its faces' normals, for a curved place :math:`\int s \kappa\, dA`, with the share :math:`s` at
-    which its curvature :math:`\kappa` counts as strong. So the level depends neither on the number
-    of points nor on that of triangles. A part :math:`dM` (m) of this adds the pressure
+
+class Diffraction:
+    r"""Points on edges and strongly curved places; each stands for what lies about it.
+
+    The points are the same for all poses, as close as the wavelength needs. One on an edge stands
+    for a stretch :math:`dM` of it; the curved places by :math:`M = \int s \kappa\, dA`, with the
+    share :math:`s` at which the curvature :math:`\kappa` counts as strong. So the level depends on
+    neither the points nor the triangles. A part :math:`dM` (m) of this adds the pressure
 
     .. math:: D\, \frac{dM}{2 \pi\, r_1 r_2}\, e^{-j k (r_1 + r_2)}\, B\, E
 
-    where emitter and ear both see it, with the material's strength :math:`D`; on an edge
-    :math:`dM` is the length alone and :math:`D` is multiplied by the directivity of a rigid wedge.
+    where emitter and ear both see it, with the material's strength :math:`D`; on an edge :math:`D`
+    is multiplied by the directivity of a rigid wedge.
+
+    In: step (m): Greatest distance between points.
     """
 
     def __init__(
-        self, scene: Scene, caster: RayCaster, reflections: tuple[Reflection, ...]
+        self,
+        scene: Scene,
+        caster: RayCaster,
+        reflections: tuple[Reflection, ...],
+        *,
+        step: float,
     ) -> None:
         self._caster = caster
-        self._edges = diffracting_edges(scene.mesh)
-        self._corners = np.asarray(scene.mesh.triangles, dtype=np.float64)
-        part = np.zeros(len(self._corners), dtype=np.int64) if scene.part is None else scene.part
-        self._part = np.concatenate([part[self._edges.triangle], part])
         self._strength = np.stack([reflection.diffraction for reflection in reflections])
         self._fade = reflections[0].fade  # the same for all materials
-        share = np.zeros(len(part))
+        faces = len(scene.mesh.faces)
+        part = np.zeros(faces, dtype=np.int64) if scene.part is None else scene.part
+        sounds = self._strength.any(axis=1)
+        edges = diffracting_edges(scene.mesh)
+        edges = edges[np.flatnonzero(sounds[part[edges.triangle]])]
+        pieces = np.maximum(np.ceil(edges.length / step), 1.0).astype(np.int64)
+        owner = np.repeat(np.arange(len(pieces)), pieces)
+        at = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        along = (edges.ends[:, 1] - edges.ends[:, 0])[owner] / pieces[owner, None]
+        self._edges = edges[owner]
+        place = edges.ends[owner, 0] + (at + 0.5)[:, None] * along
+        share = np.zeros(faces)
         for index, reflection in enumerate(reflections):
             of_part = part == index
-            share[of_part] = reflection.curved_share(caster.curvature[of_part])
-        curved = share * caster.curvature * np.asarray(scene.mesh.area_faces, dtype=np.float64)
-        turn = self._edges.open_angle - math.pi
-        measure = np.concatenate([turn * self._edges.length, curved])
-        silent = np.array([not strength.any() for strength in self._strength])
-        measure[silent[self._part]] = 0.0
-        self._end = np.cumsum(measure)
+            share[of_part] = sounds[index] * reflection.curved_share(caster.curvature[of_part])
+        area = share * np.asarray(scene.mesh.area_faces, dtype=np.float64)
+        turn = np.cumsum(caster.curvature * area)
+        points = math.ceil(area.sum() / step**2) if turn[-1] > 0.0 else 0
+        each = turn[-1] / max(points, 1)
+        fraction = (np.arange(points) + 0.5) * each
+        triangle = np.searchsorted(turn, fraction, side="right")
+        fraction = 1.0 - (turn[triangle] - fraction) / np.diff(turn, prepend=0.0)[triangle]
+        # Uniform over a triangle: Osada et al., "Shape distributions", ACM TOG 21(4), 2002.
+        root, across = np.sqrt(fraction), np.mod(np.arange(points) * GOLDEN_TURN, 1.0)
+        weights = np.stack([1.0 - root, root * (1.0 - across), root * across], axis=1)
+        corners = np.asarray(scene.mesh.triangles, dtype=np.float64)[triangle]
+        self._place = np.concatenate([place, np.einsum("nc,ncd->nd", weights, corners)])
+        self._along = np.concatenate([along, np.zeros((points, 3))])
+        self._away = np.concatenate([self._edges.away, caster.face_normals[triangle]])
+        self._amount = np.concatenate([np.linalg.norm(along, axis=1), np.full(points, each)])
+        self._part = part[np.concatenate([self._edges.triangle, triangle])]
 
-    def sound(
-        self, hearing: Hearing, position: Floats, rotation: Floats, *, points: int, offset: float
-    ) -> Sound:
+    def sound(self, hearing: Hearing, position: Floats, rotation: Floats) -> Sound:
         """Return the sound of edges and curved places at the ears of a pose.
 
         In: position ((3,), m), rotation (3, 3).
         """
         sound = hearing.silence()
-        share = self._end[-1] / points
-        if share == 0.0:
+        if not len(self._place):
             return sound
-        place, away, along, index = self._places(share, points, offset)
         emitter, ears = hearing.places(position, rotation)
-        lit = self._caster.visible(place, emitter, normals=away)
-        place, away, along, index = place[lit], away[lit], along[lit], index[lit]
-        emitted = place - emitter
+        lit = self._part_seen(np.arange(len(self._place)), emitter)
+        chosen = np.flatnonzero(lit[1] > lit[0])
+        lit = lit[:, chosen]
+        emitted = self._place[chosen] - emitter
         length = np.linalg.norm(emitted, axis=1)
         emitted /= length[:, None]
-        level = hearing.beam(emitted, rotation) * self._strength[self._part[index]]
-        level *= (share * hearing.speed_of_sound / (2.0 * math.pi) / length)[:, None]
-        on_edge = index < len(self._edges.triangle)
-        edge = index[on_edge]
-        wedge = (
-            self._edges.inward[edge], self._edges.normal[edge], self._edges.open_angle[edge],
-            emitter - place[on_edge],
-        )  # fmt: skip
-        turn = self._edges.open_angle[edge] - math.pi
+        level = hearing.beam(emitted, rotation) * self._strength[self._part[chosen]]
+        weight = self._amount[chosen] * hearing.speed_of_sound / (2.0 * math.pi)
+        level *= (weight / length)[:, None]
         for ear, listener in enumerate(ears):
-            weight = np.ones_like(level)
-            weight[on_edge] = wedge_directivity(*wedge, listener - place[on_edge], self._fade)
-            weight[on_edge] /= turn[:, None]
-            seen = self._caster.visible(place, listener, normals=away)
-            towards = listener - place[seen]
-            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-            spread = np.abs(np.einsum("nd,nd->n", along[seen], emitted[seen] - towards))
+            heard = self._part_seen(chosen, listener)
+            begin, end = np.maximum(lit[0], heard[0]), np.minimum(lit[1], heard[1])
+            some = np.flatnonzero(end > begin)
+            index, begin, end = chosen[some], begin[some], end[some]
+            along = (end - begin)[:, None] * self._along[index]
+            place = self._place[index] + (0.5 * (begin + end) - 0.5)[:, None] * self._along[index]
+            to_emitter, to_ear = emitter - place, listener - place
+            length = np.linalg.norm(to_emitter, axis=1)
+            both = to_emitter / length[:, None] + to_ear / np.linalg.norm(to_ear, axis=1)[:, None]
+            gain = level[some] * (end - begin)[:, None]
+            edge = int(np.searchsorted(index, len(self._edges.triangle)))
+            edges = self._edges[index[:edge]]
+            gain[:edge] *= wedge_directivity(
+                edges.inward, edges.normal, edges.open_angle, to_emitter[:edge], to_ear[:edge],
+                self._fade,
+            )  # fmt: skip
             hearing.add(
                 sound,
                 ear,
-                place[seen],
-                length=length[seen],
-                spread=spread / math.sqrt(12.0),
-                level=level[seen] * weight[seen],
+                place,
+                length=length,
+                spread=np.abs(np.einsum("nd,nd->n", along, both)) / math.sqrt(12.0),
+                level=gain,
                 position=position,
                 rotation=rotation,
             )
         return sound
 
-    def _places(
-        self, share: float, points: int, offset: float
-    ) -> tuple[Floats, Floats, Floats, Ints]:
-        """Return points, outward directions, the stretches they stand for (N, 3 each), kinds."""
-        at = (np.arange(points) + offset) * share
-        index = np.searchsorted(self._end, at, side="right")
-        measure = np.diff(self._end, prepend=0.0)[index]
-        fraction = 1.0 - (self._end[index] - at) / measure
-        on_edge = index < len(self._edges.triangle)
-        place, away, along = np.zeros((3, points, 3))
-        chosen = index[on_edge]
-        start, end = self._edges.ends[chosen, 0], self._edges.ends[chosen, 1]
-        place[on_edge] = start + fraction[on_edge, None] * (end - start)
-        away[on_edge] = self._edges.away[chosen]
-        along[on_edge] = (end - start) * np.minimum(share / measure[on_edge], 1.0)[:, None]
-        triangle = index[~on_edge] - len(self._edges.triangle)
-        # Uniform over a triangle: Osada et al., "Shape distributions", ACM TOG 21(4), 2002.
-        root = np.sqrt(fraction[~on_edge])
-        across = np.mod(np.flatnonzero(~on_edge) * GOLDEN_TURN + offset, 1.0)
-        weights = np.stack([1.0 - root, root * (1.0 - across), root * across], axis=1)
-        place[~on_edge] = np.einsum("nc,ncd->nd", weights, self._corners[triangle])
-        away[~on_edge] = self._caster.face_normals[triangle]
-        return place, away, along, index
+    def _part_seen(self, index: Ints, target: Floats) -> Floats:
+        """Return where the part of each stretch that a target sees begins and ends (2, N), 0 to 1.
+
+        Of a stretch with one end in the shadow, the border is found by bisection. A point that
+        stands for a curved place is seen as a whole or not at all.
+        """
+
+        def seen(index: Ints, at: Floats) -> Bools:
+            place = self._place[index] + (at - 0.5)[:, None] * self._along[index]
+            return self._caster.visible(place, target, normals=self._away[index])
+
+        first = seen(index, np.full(len(index), INSET))
+        last = seen(index, np.full(len(index), 1.0 - INSET))
+        begin, end = 1.0 - first, 1.0 * last
+        both = first == last
+        begin[both], end[both] = 0.0, 1.0 * first[both]
+        border = np.flatnonzero(~both)
+        low, high = np.zeros(len(border)), np.ones(len(border))
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            before = seen(index[border], middle) == first[border]
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        middle = 0.5 * (low + high)
+        begin[border] = np.where(first[border], 0.0, middle)
+        end[border] = np.where(first[border], middle, 1.0)
+        return np.stack([begin, end])

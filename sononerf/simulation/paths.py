@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.geometry.directions import CapSpiral, Cells
-from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Complexes, Floats, Ints, Singles, compiled
 from sononerf.scene.material import Material
 from sononerf.simulation.footprint import Footprint, MirrorPaths, emit_bundles, land, onto, paths_to
@@ -181,8 +181,6 @@ SPLIT = 2  # along each side of a divided cell
 BATCH_HITS = 8192  # hits processed together: a call of numpy costs as much as hundreds
 CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
 
-Beyond = Callable[[Hits, Floats], tuple[Hits, Floats]]
-
 
 @dataclass(frozen=True, eq=False)
 class Bounce:
@@ -198,7 +196,6 @@ class Bounce:
     length: Floats  # (H,), m: From the emitter along the path
     footprint: Footprint  # Footprint of the bundles
     triangles: Ints  # (H, n): Indices of the triangles hit so far, this one last
-    hidden: bool = False  # Whether the rays went through an obstacle as if it were not there
 
     def paths_to(self, listener: Floats) -> MirrorPaths:
         """Compare the ways of all hits to a listener (3,), m, with those of a mirror."""
@@ -222,7 +219,6 @@ class Bounce:
             self.length.take(chosen),
             Footprint(self.footprint.rows.take(chosen, axis=0)),
             self.triangles.take(chosen, axis=0),
-            self.hidden,
         )
 
 
@@ -231,11 +227,11 @@ def gathered(bounces: Iterable[Bounce]) -> Iterator[Bounce]:
 
     Indices of rays are no longer valid afterwards.
     """
-    waiting: dict[tuple[int, bool], list[Bounce]] = {}
+    waiting: dict[int, list[Bounce]] = {}
     for bounce in bounces:
         if len(bounce.ray) == 0:
             continue
-        alike = waiting.setdefault((bounce.number, bounce.hidden), [])
+        alike = waiting.setdefault(bounce.number, [])
         alike.append(bounce)
         if sum(len(part.ray) for part in alike) >= BATCH_HITS:
             yield _joined(alike)
@@ -278,7 +274,6 @@ def trace(
     bounces: int,
     *,
     solid_angle: float,
-    beyond: Beyond | None = None,
 ) -> Iterator[Bounce]:
     """Follow rays over mirror bounces.
 
@@ -289,8 +284,6 @@ def trace(
     origins = np.broadcast_to(emitter, directions.shape)
     hits = caster.first_hit(origins, directions)
     length = hits.distance
-    if beyond is not None:
-        hits, length = beyond(hits, directions)
     ray, emitted = hits.ray, directions.take(hits.ray, axis=0)
     incoming, bundles = emitted, emit_bundles(emitted, length)
     triangles = hits.triangle[:, None]
@@ -326,10 +319,9 @@ def echo_paths(
     bounces: int,
     extra: int,
     judge: Callable[[Bounce], tuple[Bools, Floats]],
-    beyond: Beyond | None = None,
     index: Ints | None = None,
 ) -> Iterator[Bounce]:
-    """Follow the rays of a cap, with more rays where a few would give noise.
+    """Follow the rays of a cap over later bounces, with more where a few would give noise.
 
     A curved surface spreads neighbouring rays tenfold and more at each bounce, so a pattern that
     is dense at the first hit is sparse at the second. The cells of doubtful rays are divided
@@ -347,9 +339,9 @@ def echo_paths(
         solid_angle = cap.solid_angle / parts
         for start in range(0, len(directions), CHUNK):
             chunk = directions[start : start + CHUNK]
-            for bounce in trace(
-                caster, emitter, chunk, bounces, solid_angle=solid_angle, beyond=beyond
-            ):
+            for bounce in trace(caster, emitter, chunk, bounces, solid_angle=solid_angle):
+                if bounce.number == 1:
+                    continue
                 bounce = replace(bounce, ray=rays.take(bounce.ray + start))
                 if extra < SPLIT**2:  # no cell can be divided further
                     audible_bounces.append((bounce, np.arange(len(bounce.ray))))

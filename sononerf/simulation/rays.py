@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Rays over several bounces, summed as Kirchhoff's integral."""
+"""Kirchhoff's integral: the first bounce over points of the surface, later ones by rays."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,10 +12,10 @@ from numpy.typing import NDArray
 
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.meshes import bodies, enclosing_balls
-from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats, Ints, Singles
 from sononerf.scene.scene import Scene
-from sononerf.simulation.diffraction import Diffraction, Outlines
+from sononerf.simulation.diffraction import EDGE_STEP, Diffraction, Outlines
 from sononerf.simulation.hearing import (
     EARS_APART,
     RESOLVED_FREQUENCY,
@@ -35,10 +33,9 @@ from sononerf.simulation.paths import (
     reflection,
     unfaded,
 )
-from sononerf.simulation.shadows import MIN_FACTOR, Shadow, behind, passing
+from sononerf.simulation.shadows import Shadow, passing
+from sononerf.simulation.surface_points import SurfacePoints
 
-HIDDEN_SHARE = 0.15  # as many rays again, for surfaces behind obstacles
-HIDDEN_DIVIDED = 0.4  # of these, kept as above
 DIVIDED_SHARE = 0.6  # fraction of the rays that is kept where a few would be noise
 MAX_BEND = 0.3  # rad; a cell over which the path bends by less is fine enough
 SILENT_EXPONENT = 7.0  # e to the minus this is -61 dB
@@ -48,10 +45,12 @@ ENCLOSING_BALLS = (
 
 
 class Rays:
-    r"""Echoes by rays.
+    r"""Echoes by geometrical acoustics and Kirchhoff's integral.
 
-    Rays fill the cap under which the emitter sees the scene, each standing for the same solid
-    angle :math:`d\Omega`. Every hit is heard by every ear that sees it, with the pressure
+    What arrives at the surface first is summed over points of it, the same for all poses,
+    :class:`SurfacePoints`. What bounces on is followed by rays, which fill the cap under which the
+    emitter sees the scene, each standing for the same solid angle :math:`d\Omega`. Every point that
+    is hit is heard by every ear that sees it, with the pressure
 
     .. math:: \frac{j f}{c}\, \frac{\sqrt{d\Omega\, dA}}{r_2}\, s\, l\,
         e^{-j k (r_1 + r_2)}\, 10^{-\alpha (r_1 + r_2) / 20}\, B\, E \prod q
@@ -70,9 +69,8 @@ class Rays:
     of rays, a plate answers as :math:`1/2h` and a sphere as :math:`a / 2 r^2`. Phase shifts at
     foci of hollow surfaces are left out, but for those after the last bounce.
 
-    The first hits are lit, and heard, past obstacles as the Fresnel zone says: each of the two
-    ways has a factor, :class:`Shadow`. What lies behind an obstacle is sought by rays that go
-    through it. Shadows of later bounces are sharp.
+    Of the first bounce points are lit, and heard, past obstacles as the Fresnel zone says: each of
+    the two ways has a factor, :class:`Shadow`. Shadows of later bounces are sharp.
 
     In: band (K,).
     """
@@ -84,7 +82,6 @@ class Rays:
         *,
         rays: int,
         bounces: int,
-        diffraction_points: int,
         band: Floats | None = None,
     ) -> None:
         self.scene, self.hearing = scene, hearing
@@ -122,10 +119,10 @@ class Rays:
         wavenumber = 2.0 * math.pi / hearing.speed_of_sound * synthesis.nodes
         self._wavenumber = wavenumber.astype(np.float32)
         self._reach = max(of_part.reach for of_part in self.reflections)
-        self.diffraction_points = diffraction_points
         self._diffracts = any(reflection.diffraction.any() for reflection in self.reflections)
         self._diffraction: Diffraction | None = None
         self._outlines: Outlines | None = None
+        self._points: SurfacePoints | None = None
         self._of_image: Rays | None = None
         if hearing.head.plane is not None and hearing.image is None:
             self._of_image = Rays(
@@ -133,7 +130,6 @@ class Rays:
                 hearing.from_image,
                 rays=rays,
                 bounces=bounces,
-                diffraction_points=diffraction_points,
                 band=band,
             )
 
@@ -155,6 +151,25 @@ class Rays:
             self._caster = RayCaster(self.scene.mesh)
         return self._caster
 
+    @property
+    def outlines(self) -> Outlines:
+        """Edges of the scene that may throw shadows."""
+        if self._outlines is None:
+            self._outlines = Outlines(self.scene.mesh)
+        return self._outlines
+
+    @property
+    def points(self) -> SurfacePoints:
+        """Points at which the first bounce is summed."""
+        if self._points is None:
+            self._points = SurfacePoints(
+                self.scene.mesh,
+                self.caster,
+                self.outlines.closed,
+                wavelength=self.hearing.speed_of_sound / RESOLVED_FREQUENCY,
+            )
+        return self._points
+
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Return the pressure at the ears (E, S) for a call that is one sample of height 1.
 
@@ -166,46 +181,44 @@ class Rays:
         return echo
 
     def _echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
-        first, second, third = np.random.default_rng(seed).random(3)
+        first, second = np.random.default_rng(seed).random(2)
         sound, quadrature = self.hearing.silence(), self.hearing.silence()
         shadows = self._shadows(position, rotation)
-        lit = self._paths(position, rotation, (first, second), self.bounces)
-        hidden = self._hidden(position, rotation, (first, second), shadows[0])
-        for bounce in chain(gathered(lit), gathered(hidden)):
-            self._hear(sound, quadrature, bounce, position, rotation, shadows)
+        self._hear(sound, quadrature, self._first(position, rotation), position, rotation, shadows)
+        for bounce in gathered(self._paths(position, rotation, (first, second))):
+            self._hear(sound, quadrature, bounce, position, rotation, [])
         echo = self.hearing.echo(sound, self._basis)
         if quadrature.heard:
             echo += self.hearing.echo(quadrature, self._quadrature_basis)
         if self._diffracts:
             if self._diffraction is None:
-                self._diffraction = Diffraction(self.scene, self.caster, self.reflections)
-            edges = self._diffraction.sound(
-                self.hearing, position, rotation, points=self.diffraction_points, offset=third
-            )
+                step = EDGE_STEP * self.hearing.speed_of_sound / RESOLVED_FREQUENCY
+                self._diffraction = Diffraction(
+                    self.scene, self.caster, self.reflections, step=step
+                )
+            edges = self._diffraction.sound(self.hearing, position, rotation)
             echo += self.hearing.echo(edges, self._hats)
         return echo
 
     def later(self, sound: Listener, position: Floats, rotation: Floats, *, seed: int) -> None:
         """Pass the echoes of the first bounce to a listener; edges are left out."""
-        first, second, _ = np.random.default_rng(seed).random(3)
-        paths = self._paths(position, rotation, (first, second), self.bounces)
-        for bounce in gathered(bounce for bounce in paths if bounce.number > 1):
+        first, second = np.random.default_rng(seed).random(2)
+        for bounce in gathered(self._paths(position, rotation, (first, second))):
             self._hear(sound, sound, bounce, position, rotation, [])
         if self._of_image is not None:
             self._of_image.later(sound, position, rotation, seed=seed)
 
     def __getstate__(self) -> dict[str, Any]:
         # Search trees cannot be pickled; who receives the mesh builds them anew.
-        return {**self.__dict__, "_caster": None, "_diffraction": None, "_outlines": None}
+        built = ("_caster", "_diffraction", "_outlines", "_points")
+        return {**self.__dict__, **dict.fromkeys(built)}
 
     def _shadows(self, position: Floats, rotation: Floats) -> list[Shadow]:
         """Shadows of the emitter and of each ear."""
-        if self._outlines is None:
-            self._outlines = Outlines(self.scene.mesh)
         emitter, ears = self.hearing.places(position, rotation)
         return [
             Shadow(
-                self._outlines,
+                self.outlines,
                 self.caster,
                 place,
                 wavenumber=self._wavenumber.astype(np.float64),
@@ -215,24 +228,31 @@ class Rays:
             for place in (emitter, *ears)
         ]
 
-    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
+    def hits(self, position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
         """Return places that send sound straight back (N, 3), m, and their strength (N,)."""
-        first, second, _ = np.random.default_rng(seed).random(3)
-        points, strength = [np.zeros((0, 3))], [np.zeros(0)]
-        for bounce in self._paths(position, rotation, (first, second), 1):
-            total = np.zeros(len(bounce.ray))
-            level = self._level(bounce) * self.hearing.beam(bounce.emitted, rotation)
-            for place in self.hearing.places(position, rotation)[1]:
-                heard, gain, _, _ = self._heard(bounce, place)
-                total[heard] += np.square(gain * level[heard]).mean(axis=1)
-            # Cells of one size alone: a divided cell is smaller than a whole one.
-            points.append(bounce.points)
-            strength.append(np.sqrt(total) / bounce.solid_angle)
-        return np.concatenate(points), np.concatenate(strength)
+        bounce = self._first(position, rotation)
+        bounce = bounce[np.flatnonzero(self._lit(bounce, position, rotation))]
+        total = np.zeros(len(bounce.ray))
+        level = self._level(bounce) * self.hearing.beam(bounce.emitted, rotation)
+        for place in self.hearing.places(position, rotation)[1]:
+            heard, gain, _, _ = self._heard(bounce, place)
+            total[heard] += np.square(gain * level[heard]).mean(axis=1)
+        # Cells are of different sizes.
+        return bounce.points, np.sqrt(total) / bounce.solid_angle
+
+    def _first(self, position: Floats, rotation: Floats) -> Bounce:
+        return self.points.lit_from(self.hearing.places(position, rotation)[0])
+
+    def _lit(self, bounce: Bounce, position: Floats, rotation: Floats) -> Bools:
+        """Return the mask (H,) of first hits that the emitter sees."""
+        emitter, _ = self.hearing.places(position, rotation)
+        return self.caster.visible(bounce.points, emitter, normals=bounce.flat)
 
     def _paths(
-        self, position: Floats, rotation: Floats, offset: tuple[float, float], bounces: int
+        self, position: Floats, rotation: Floats, offset: tuple[float, float]
     ) -> Iterator[Bounce]:
+        if self.bounces < 2:
+            return iter(())
         emitter, _ = self.hearing.places(position, rotation)
         axis, half_angle = aim(emitter, self._centre, self._radius)
         extra = round(self.rays * DIVIDED_SHARE)
@@ -246,7 +266,7 @@ class Rays:
 
         index = self._reaching(cap, emitter)
         return echo_paths(
-            self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge, index=index
+            self.caster, emitter, cap, bounces=self.bounces, extra=extra, judge=judge, index=index
         )
 
     def _reaching(self, cap: CapSpiral, emitter: Floats) -> Ints:
@@ -258,39 +278,6 @@ class Rays:
         sine = radii * 1.001 / np.maximum(distance, 1e-300)
         half_angle = np.where(sine < 1.0, np.arcsin(np.minimum(sine, 1.0)), math.pi)
         return cap.reaching(offsets / np.maximum(distance, 1e-300)[:, None], half_angle)
-
-    def _hidden(
-        self, position: Floats, rotation: Floats, offset: tuple[float, float], shadow: Shadow
-    ) -> Iterator[Bounce]:
-        """Return the first hits behind obstacles, as if the obstacles were not there."""
-        outlines = self._outlines
-        if shadow.none or outlines is None:
-            return
-        emitter, _ = self.hearing.places(position, rotation)
-        listeners = self._listeners(position, rotation)
-        rays = round(self.rays * HIDDEN_SHARE)
-        extra = round(rays * HIDDEN_DIVIDED)
-        axis, half_angle = aim(emitter, self._centre, self._radius)
-        cap = CapSpiral(max(rays - extra, 1), axis @ rotation, half_angle, offset, rotation)
-
-        def judge(bounce: Bounce) -> tuple[Bools, Floats]:
-            audible, doubt = self._audibility.judge(bounce, listeners)
-            chosen = np.flatnonzero(audible)
-            level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
-            audible[chosen] = level > MIN_FACTOR
-            passed = np.zeros(len(doubt))
-            passed[chosen] = level
-            return audible, doubt * passed
-
-        def beyond(hits: Hits, directions: Floats) -> tuple[Hits, Floats]:
-            return behind(self.caster, outlines, hits, directions)
-
-        index = self._reaching(cap, emitter)
-        for bounce in echo_paths(
-            self.caster, emitter, cap, bounces=1, extra=extra, judge=judge, beyond=beyond,
-            index=index,
-        ):  # fmt: skip
-            yield replace(bounce, hidden=True)
 
     def _listeners(self, position: Floats, rotation: Floats) -> Floats:
         """Return places (L, 3) that together stand for all ears, m, world frame."""
@@ -313,9 +300,9 @@ class Rays:
         rotation: Floats,
         shadows: list[Shadow],
     ) -> None:
-        soft = bounce.number == 1
+        is_lit = self._lit(bounce, position, rotation) if shadows else None
         heard_by = [
-            self._heard(bounce, place, *((shadows[0], shadows[1 + ear]) if soft else ()))
+            self._heard(bounce, place, is_lit, *((shadows[0], shadows[1 + ear]) if shadows else ()))
             for ear, place in enumerate(self.hearing.places(position, rotation)[1])
         ]
         anyone = np.zeros(len(bounce.ray), dtype=bool)
@@ -340,7 +327,12 @@ class Rays:
             )
 
     def _heard(
-        self, bounce: Bounce, ear: Floats, lit: Shadow | None = None, shadow: Shadow | None = None
+        self,
+        bounce: Bounce,
+        ear: Floats,
+        is_lit: Bools | None = None,
+        lit: Shadow | None = None,
+        shadow: Shadow | None = None,
     ) -> tuple[Ints, NDArray[np.floating[Any]], Singles, tuple[Ints, NDArray[np.complex64]] | None]:
         """Return the hits (N,) of an ear, their gain (N, F), and the spread of their paths (N,), m.
 
@@ -354,7 +346,7 @@ class Rays:
         seen = self.caster.visible(
             bounce.points.take(near, axis=0), ear, normals=bounce.flat.take(near, axis=0)
         )
-        seen, shaded = self._shaded(bounce, near, seen, lit, shadow)
+        seen, shaded = self._shaded(bounce, near, seen, is_lit, lit, shadow)
         near = near[np.flatnonzero(seen)]
         triangle = bounce.triangles[near, -1]
         gain = self._gain(triangle, paths.cosine.take(near), paths.detour.take(near))
@@ -365,14 +357,20 @@ class Rays:
         return near, gain, paths.spread.take(near), shaded
 
     def _shaded(
-        self, bounce: Bounce, near: Ints, seen: Bools, lit: Shadow | None, shadow: Shadow | None
+        self,
+        bounce: Bounce,
+        near: Ints,
+        seen: Bools,
+        is_lit: Bools | None,
+        lit: Shadow | None,
+        shadow: Shadow | None,
     ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
         """Return the mask of hits that pass obstacles, and the transmission near an outline."""
-        points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
-        if lit is None or shadow is None:
+        if is_lit is None or lit is None or shadow is None:
             return seen, None
+        points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         first, second = lit.passed(points, triangle), shadow.passed(points, triangle)
-        passes, dim, passed = passing(*first, not bounce.hidden, *second, seen)
+        passes, dim, passed = passing(*first, is_lit.take(near), *second, seen)
         return passes, (dim, passed) if len(dim) else None
 
     def _level(self, bounce: Bounce) -> Floats:

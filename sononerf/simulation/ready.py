@@ -29,7 +29,7 @@ def trace_once() -> None:
     """Trace a few rays off two spheres that shade each other, so that all loops are compiled."""
     balls = [trimesh.creation.icosphere(1, radius=0.02) for _ in range(2)]
     balls[1].apply_translation([-0.05, 0.0, 0.01])
-    options = SimulationSettings(engine="rays", rays=300, diffraction_points=10)
+    options = SimulationSettings(engine="rays", rays=300)
     head = Head(
         ears=EarSettings(),
         call=CallSettings(),

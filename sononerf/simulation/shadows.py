@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Complexes, Floats, Ints, compiled
 from sononerf.simulation.diffraction import Outlines
 from sononerf.simulation.hearing import RESOLVED_FREQUENCY
@@ -24,8 +24,6 @@ MAX_DETOUR = 0.4 / NODE_SPACING
 """Longest detour over an outline that is kept, s; longer ones turn too fast between the nodes."""
 DETOUR_STEPS = 12
 """Steps per wavelength in which detours are sorted."""
-LAYERS = 3
-"""Number of surfaces that a ray through an obstacle may pass: into it, out of it, and one more."""
 UNKNOWN = -2
 """Index of a cell that has not been solved for."""
 MIN_FACTOR = 0.02
@@ -188,17 +186,6 @@ class Shadow:
             row[new] = self._rows[key[new]]
         return row, self._table
 
-    @property
-    def none(self) -> bool:
-        """True if no body throws a shadow."""
-        return self._pieces is None
-
-    def level(self, points: Floats, triangle: Ints) -> Floats:
-        """Return the largest transmission (N,) over frequency to points in the shadow."""
-        row, table = self.passed(points, triangle)
-        most = np.append(np.abs(table).max(axis=1, initial=0.0), 0.0)
-        return most[row]
-
     def _solve(self, points: Floats, body: Ints) -> NDArray[np.int32]:
         pieces = self._pieces
         assert pieces is not None
@@ -335,14 +322,14 @@ def _lay(
 def passing(
     lit: NDArray[np.int32],
     lit_table: NDArray[np.complex64],
-    is_lit: bool,
+    is_lit: Bools,
     heard: NDArray[np.int32],
     heard_table: NDArray[np.complex64],
     is_seen: Bools,
 ) -> tuple[Bools, Ints, NDArray[np.complex64]]:
     """Return the transmission past obstacles on the ways to points and on from there.
 
-    In: lit, heard (N,), lit_table, heard_table (C, F), is_seen (N,). Out: passes (N,), dim (M,),
+    In: lit, heard (N,), lit_table, heard_table (C, F), is_lit, is_seen (N,). Out: passes (N,), dim (M,),
     passed (M, F).
     """
     frequencies = lit_table.shape[1]
@@ -350,7 +337,7 @@ def passing(
     dim, count, kept = np.zeros(len(lit), np.int64), 0, 0
     passed = np.zeros((len(lit), frequencies), np.complex64)
     for i in range(len(lit)):
-        if not ((is_lit or lit[i] >= 0) and (is_seen[i] or heard[i] >= 0)):
+        if not ((is_lit[i] or lit[i] >= 0) and (is_seen[i] or heard[i] >= 0)):
             continue
         if lit[i] >= 0 or heard[i] >= 0:
             loudest = 0.0
@@ -374,43 +361,3 @@ def passing(
 def _product(real: Floats, factor: Complexes) -> Complexes:
     """Multiply a real matrix by a complex one, without making the real one complex."""
     return (real @ factor.view(np.float64)).view(np.complex128)
-
-
-def behind(
-    caster: RayCaster, outlines: Outlines, hits: Hits, directions: Floats
-) -> tuple[Hits, Floats]:
-    """Return the hits of rays beyond the first obstacle, and the whole paths (M,) there, m."""
-    ray, points, length = hits.ray, hits.points, hits.distance
-    parts: list[tuple[Hits, Floats]] = []
-    for _ in range(LAYERS):
-        along = directions.take(ray, axis=0)
-        further = caster.first_hit(points + caster.lift * along, along)
-        along = along.take(further.ray, axis=0)
-        length = length.take(further.ray) + further.distance
-        ray = ray.take(further.ray)
-        # Of a closed body the inner side is no surface.
-        into = np.einsum("nd,nd->n", along, further.flat) < 0.0
-        good = into | ~outlines.closed[further.triangle]
-        kept = np.flatnonzero(good)
-        parts.append((_chosen(further, kept, ray), length[kept]))
-        left = np.flatnonzero(~good)
-        ray, points, length = ray[left], further.points[left], length[left]
-        if len(ray) == 0:
-            break
-    hidden = [part for part in parts if len(part[1])] or parts[:1]
-    joined = Hits(
-        *(np.concatenate([getattr(part, of.name) for part, _ in hidden]) for of in fields(Hits))
-    )
-    return joined, np.concatenate([way for _, way in hidden])
-
-
-def _chosen(hits: Hits, kept: Ints, ray: Ints) -> Hits:
-    return Hits(
-        ray[kept],
-        hits.points[kept],
-        hits.normals[kept],
-        hits.triangle[kept],
-        hits.distance[kept],
-        hits.flat[kept],
-        hits.gradients[kept],
-    )

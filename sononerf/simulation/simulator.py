@@ -92,7 +92,6 @@ class Simulator:
             hearing,
             rays=options.rays or DEFAULT_RAYS,
             bounces=options.bounces,
-            diffraction_points=options.diffraction_points,
             band=band,
         )
 
@@ -118,9 +117,9 @@ class Simulator:
             with progress.task("solving", len(self.low.frequency)) as task:
                 self.low.prepare(positions, rotations, task.advance)
 
-    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
+    def hits(self, position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
         """Places (N, 3) that send sound straight back, m, and how much (N,), dB below the most."""
-        points, strength = self.rays.hits(position, rotation, seed=seed)
+        points, strength = self.rays.hits(position, rotation)
         loudest = max(float(strength.max(initial=0.0)), 1e-300)
         return points, 20.0 * np.log10(np.maximum(strength / loudest, 1e-10))
 

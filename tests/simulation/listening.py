@@ -17,7 +17,7 @@ from tests.simulation.exact import SPEED
 ANALYSIS = SpectrogramSettings(range_max=0.8)
 SYNTHESIS = plan_synthesis(ANALYSIS, echo_samples(ANALYSIS, SPEED))
 NODES = SYNTHESIS.nodes
-RIGHT = {"rays": 40_000, "bounces": 1, "diffraction_points": 4000}
+RIGHT = {"rays": 40_000, "bounces": 1}
 
 
 def hearing(emitter=(0.0, 0.0, 0.0), ears=((0.0, 0.0, 0.0),), absorption=0.0):

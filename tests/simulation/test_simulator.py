@@ -67,20 +67,17 @@ def test_first_echo_of_a_sphere_comes_from_its_front():
     assert abs(peak - 0.385) <= np.diff(found.head.range)[0] / 2 + 5e-6
 
 
-@pytest.mark.parametrize(("material", "error"), [(PLAIN, 0.04), (WIDE, 0.015)])
+@pytest.mark.parametrize(("material", "error"), [(PLAIN, 0.02), (WIDE, 0.02)])
 def test_a_wide_plate_is_a_mirror(material, error):
-    """Image source: pressure 1 / (2 h), air taken off, at any frequency and number of rays."""
+    """Image source: pressure 1 / (2 h), air taken off, at any frequency."""
     height, frequency = 0.3, np.array([40e3, 60e3, 90e3])
-    scene = Scene(plate([height, -0.4, -0.4], [height + 0.01, 0.4, 0.4]), material)
+    scene = Scene(plate([height, -0.25, -0.25], [height + 0.01, 0.25, 0.25]), material)
     air = 10 ** (-air_absorption(frequency, relative_humidity=0.5) * 2 * height / 20)
-    levels = []
-    for rays in (200_000, 400_000):
-        found = simulator(scene, rays, ears=POINT_HEAD, simulation={"rays": rays, "bounces": 1})
-        echo = found.echo(np.zeros(3), np.eye(3), seed=1)
-        levels.append(np.abs(spectrum(echo[0], frequency)))
-    # Of a lobe, ripples of its width; of a smooth plate, rays by the hundred in the first zone.
-    np.testing.assert_allclose(levels[1], air / (2 * height), rtol=error)
-    np.testing.assert_allclose(levels[0], levels[1], rtol=error)
+    found = simulator(scene, 1000, ears=POINT_HEAD, simulation={"rays": 1000, "bounces": 1})
+    echo = found.echo(np.zeros(3), np.eye(3), seed=1)
+    # Of a lobe, ripples of its width.
+    level = np.abs(spectrum(echo[0], frequency))
+    np.testing.assert_allclose(level, air / (2 * height), rtol=error)
 
 
 def test_a_corner_answers_like_the_image_behind_its_edge():
@@ -318,7 +315,7 @@ def test_the_noise_of_the_settings_is_drawn_from_the_poses_seed():
 
 def test_hits_are_in_decibels_below_the_strongest():
     found = simulator(load_scene("sphere"), 5000)
-    points, level = found.hits(np.array([0.4, 0.0, 0.0]), rotation_from_euler(np.pi, 0, 0), seed=0)
+    points, level = found.hits(np.array([0.4, 0.0, 0.0]), rotation_from_euler(np.pi, 0, 0))
     assert len(points) == len(level)
     assert level.max() == 0.0
     assert level.min() >= -200.0
@@ -326,10 +323,10 @@ def test_hits_are_in_decibels_below_the_strongest():
 
 
 def test_settings_of_the_rays_go_through():
-    wanted = {"rays": 1234, "bounces": 2, "diffraction_points": 77}
+    wanted = {"rays": 1234, "bounces": 2}
     for engine in ("rays", "hybrid"):
         rays = simulator(load_scene("sphere"), simulation={"engine": engine, **wanted}).rays
-        assert (rays.rays, rays.bounces, rays.diffraction_points) == (1234, 2, 77)
+        assert (rays.rays, rays.bounces) == (1234, 2)
 
 
 @pytest.mark.parametrize(("highest", "lines"), [(100e3, 0), (150e3, 1)])
