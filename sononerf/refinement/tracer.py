@@ -206,11 +206,7 @@ class Tracer:
     """The simulator's rays on a surface."""
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:
-        options = SimulationSettings(
-            engine="rays",
-            rays=rays,
-            bounces=BOUNCES,
-        )
+        options = SimulationSettings(engine="rays", rays=rays, bounces=BOUNCES)
         self._simulator = Simulator(Scene(mesh, warns=False), optics.head, options)
         self._nodes, self._seed = _Nodes.of(optics), seed
 

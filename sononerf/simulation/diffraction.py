@@ -313,19 +313,14 @@ class Diffraction:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        caster: RayCaster,
-        reflections: tuple[Reflection, ...],
-        *,
-        step: float,
+        self, scene: Scene, caster: RayCaster, reflections: tuple[Reflection, ...], *, step: float
     ) -> None:
         self._caster = caster
         self._strength = np.stack([reflection.diffraction for reflection in reflections])
         self._fade = reflections[0].fade  # the same for all materials
         faces = len(scene.mesh.faces)
         part = np.zeros(faces, dtype=np.int64) if scene.part is None else scene.part
-        sounds = self._strength.any(axis=1)
+        sounds = np.any(self._strength, axis=1)
         edges = diffracting_edges(scene.mesh)
         edges = edges[np.flatnonzero(sounds[part[edges.triangle]])]
         pieces = np.maximum(np.ceil(edges.length / step), 1.0).astype(np.int64)
@@ -415,10 +410,8 @@ class Diffraction:
 
         first = seen(index, np.full(len(index), INSET))
         last = seen(index, np.full(len(index), 1.0 - INSET))
-        begin, end = 1.0 - first, 1.0 * last
-        both = first == last
-        begin[both], end[both] = 0.0, 1.0 * first[both]
-        border = np.flatnonzero(~both)
+        begin, end = np.where(first, 0.0, 1.0), np.where(last, 1.0, 0.0)
+        border = np.flatnonzero(first ^ last)
         low, high = np.zeros(len(border)), np.ones(len(border))
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)

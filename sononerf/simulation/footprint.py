@@ -83,6 +83,46 @@ class MirrorPaths:
     detour: Singles
     spread: Singles  # (H,) float32, m: Standard deviation of the path's length over the cell
     stiffness: Singles  # (H,) float32, m/rad²: The greater eigenvalue of :math:`|H|`
+    softness: Singles  # (H,) float32, m/rad²: The smaller one
+
+
+@compiled
+def _derivatives(
+    row: Singles, point: Floats, flat: Floats, mirrored: Floats, listener: Floats
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Return distance, cosine, rise, slopes by u and v, and second derivatives of one path."""
+    x, y, z = listener[0] - point[0], listener[1] - point[1], listener[2] - point[2]
+    far = math.sqrt(x * x + y * y + z * z)
+    near = 1.0 / far
+    x, y, z = x * near, y * near, z * near
+    rise = x * flat[0] + y * flat[1] + z * flat[2]
+    cosine = x * mirrored[0] + y * mirrored[1] + z * mirrored[2]
+    off1 = row[0] * x + row[1] * y + row[2] * z
+    off2 = row[3] * x + row[4] * y + row[5] * z
+    # From the mirror direction and not from the incoming one: the same on the smooth surface
+    # that the triangles stand for, without their facets.
+    g1, g2 = row[15] - off1, row[16] - off2
+    lean = rise - row[17]
+    h11 = row[9] + lean * row[12] + (row[6] - off1 * off1) * near
+    h22 = row[10] + lean * row[13] + (row[7] - off2 * off2) * near
+    h12 = row[11] + lean * row[14] + (row[8] - off1 * off2) * near
+    return far, cosine, rise, g1, g2, h11, h22, h12
+
+
+@compiled
+def path_derivatives(
+    rows: Singles, points: Floats, flat: Floats, mirrored: Floats, listener: Floats
+) -> Floats:
+    """Return distance, cosine, rise, both slopes and second derivatives 11, 22, 12 (8, H) of paths.
+
+    As :func:`paths_to`, over u and v.
+    """
+    values = np.zeros((8, len(rows)))
+    for i in range(len(rows)):
+        one = _derivatives(rows[i], points[i], flat[i], mirrored[i], listener)
+        for k in range(8):
+            values[k, i] = one[k]
+    return values
 
 
 @compiled
@@ -94,33 +134,18 @@ def paths_to(
     listener: Floats,
     solid_angle: Floats,
 ) -> tuple[Floats, Floats, Singles]:
-    """Return the attributes of :class:`Ways`: distance, cosine, and the rest as (4, H).
+    """Return the attributes of :class:`Ways`: distance, cosine, and the rest as (5, H).
 
     In: rows ((H, 19) float32), points, flat, mirrored (H, 3), listener ((3,), m), solid_angle ((H,)
     or (1,), sr).
     """
     count = len(rows)
     distance, cosine = np.zeros(count), np.zeros(count)
-    sizes = np.zeros((4, count), np.float32)
+    sizes = np.zeros((5, count), np.float32)
     for i in range(count):
-        row = rows[i]
-        x = listener[0] - points[i, 0]
-        y = listener[1] - points[i, 1]
-        z = listener[2] - points[i, 2]
-        far = math.sqrt(x * x + y * y + z * z)
-        near = 1.0 / far
-        x, y, z = x * near, y * near, z * near
-        rise = x * flat[i, 0] + y * flat[i, 1] + z * flat[i, 2]
-        cosine[i] = x * mirrored[i, 0] + y * mirrored[i, 1] + z * mirrored[i, 2]
-        off1 = row[0] * x + row[1] * y + row[2] * z
-        off2 = row[3] * x + row[4] * y + row[5] * z
-        # From the mirror direction and not from the incoming one: the same on the smooth surface
-        # that the triangles stand for, without their facets.
-        g1, g2 = row[15] - off1, row[16] - off2
-        lean = rise - row[17]
-        h11 = row[9] + lean * row[12] + (row[6] - off1 * off1) * near
-        h22 = row[10] + lean * row[13] + (row[7] - off2 * off2) * near
-        h12 = row[11] + lean * row[14] + (row[8] - off1 * off2) * near
+        far, along, rise, g1, g2, h11, h22, h12 = _derivatives(
+            rows[i], points[i], flat[i], mirrored[i], listener
+        )
         middle, apart = 0.5 * (h11 + h22), 0.5 * (h11 - h22)
         half = math.sqrt(apart * apart + h12 * h12)
         # |H|^-1 is a I + b H, with a and b such that both eigenvalues fit.
@@ -136,11 +161,12 @@ def paths_to(
         angle = solid_angle[i if len(solid_angle) > 1 else 0]
         variance = slope * (angle / 12.0) + (h11 * h11 + h22 * h22) * (angle * angle / 720.0)
         variance += h12 * h12 * (angle * angle / 144.0)
-        distance[i] = far
+        distance[i], cosine[i] = far, along
         sizes[0, i] = rise
         sizes[1, i] = max(detour, 0.0)
         sizes[2, i] = math.sqrt(variance)
         sizes[3, i] = stiffness
+        sizes[4, i] = min(high, low)
     return distance, cosine, sizes
 
 

@@ -48,15 +48,18 @@ EARS_APART = 0.03
 
 @dataclass(frozen=True)
 class Audibility:
-    """Test of the hits of a bounce for audibility."""
+    """Test of the hits of later bounces for audibility."""
 
     wavenumber: float  # rad/m: At the frequency that bundles must resolve
     farthest: float  # m: Longest detour that is heard
     radius: float  # m: Radius of the scene
     bounces: int  # Largest number of hits of a ray
 
-    def judge(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
-        """Return the mask (H,) of audible hits, and the possible error of each (H,)."""
+    def judge(self, bounce: Bounce, listeners: Floats, least: float) -> tuple[Bools, Floats]:
+        """Return the mask (H,) of audible hits, and the possible error of each (H,).
+
+        Hits with sharper mirror paths than ``least`` (m/rad²) are no cells of the integral.
+        """
         count = len(bounce.ray)
         audible, doubt = np.zeros(count, dtype=np.bool_), np.zeros(count)
         # Sound that continues from here may be heard, whatever the view from the head.
@@ -66,8 +69,8 @@ class Audibility:
         for place in listeners:
             paths = bounce.paths_to(place)
             _judge(
-                audible, doubt, paths.distance, paths.rise, paths.detour, paths.stiffness, tube,
-                angle, self.wavenumber, self.farthest, explore,
+                audible, doubt, paths.distance, paths.rise, paths.detour, paths.stiffness,
+                paths.softness > least, tube, angle, self.wavenumber, self.farthest, explore,
             )  # fmt: skip
         return audible, doubt
 
@@ -80,6 +83,7 @@ def _judge(
     rise: Singles,
     detour: Singles,
     stiffness: Singles,
+    is_sharp: Bools,
     tube: Singles,
     solid_angle: Floats,
     k: float,
@@ -88,8 +92,8 @@ def _judge(
 ) -> None:
     """Add one listener to the audible hits (H,) and their doubts (H,).
 
-    In: audible, doubt (H,), distance, rise, detour, stiffness (H,), tube ((H,), m²/sr), solid_angle
-    ((H,) or (1,), sr), k (rad/m), farthest (m), explore (1/m).
+    In: audible, doubt (H,), distance, rise, detour, stiffness, is_sharp (H,), tube ((H,), m²/sr),
+    solid_angle ((H,) or (1,), sr), k (rad/m), farthest (m), explore (1/m).
     """
     for i in range(len(distance)):
         angle = solid_angle[i if len(solid_angle) > 1 else 0]
@@ -97,13 +101,13 @@ def _judge(
         level = angle * width
         # Seen from an ear either may be somewhat different from the middle between the ears.
         facing = rise[i] * distance[i] > -EARS_APART
-        if facing and detour[i] < 1.25 * farthest:
+        if is_sharp[i] or (facing and detour[i] < 1.25 * farthest):
             audible[i] = True
         # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
         off = math.sqrt(2.0 * detour[i] / max(stiffness[i], 1e-12)) - MAX_BUNDLE_SIDES * side
         least = 0.5 * stiffness[i] * max(off, 0.0) ** 2
         turns = k * stiffness[i] * angle
-        if facing and turns > RESOLVED and k * least < MAX_PHASE:
+        if facing and turns > RESOLVED and k * least < MAX_PHASE and not is_sharp[i]:
             found = level / distance[i] * math.exp(-k * least) * min(turns, 10.0)
             doubt[i] = max(doubt[i], found)
         if side * width > MAX_BUNDLE_WIDTH:

@@ -62,11 +62,8 @@ class Reflection:
 
         In: cosine (N,), detour ((N,), m), curvature ((N,), 1/m). Out: gain (N, F).
         """
-        strength = self.strength
-        share = None
-        if self.material.mixed:
-            share = self.curved_share(curvature)[:, None]
-            strength = strength + share * (self.curved_strength - strength)
+        strength = self.strength_at(curvature)
+        share = self.curved_share(curvature)[:, None] if self.material.mixed else None
         gain: NDArray[np.floating[Any]]
         if self.material.lobe_width is None:
             gain = np.exp(np.multiply.outer(detour, -self.fade.astype(np.float32)))
@@ -77,6 +74,13 @@ class Reflection:
             gain = np.exp(lobe_exponent(cosine, width))
         gain *= strength
         return gain
+
+    def strength_at(self, curvature: Floats) -> Floats:
+        """Return the strength (F,) or (N, F) of places of a total curvature (N,), 1/m."""
+        if not self.material.mixed:
+            return self.strength
+        share = self.curved_share(curvature)[:, None]
+        return self.strength + share * (self.curved_strength - self.strength)
 
     @property
     def reach(self) -> float:
@@ -234,14 +238,15 @@ def gathered(bounces: Iterable[Bounce]) -> Iterator[Bounce]:
         alike = waiting.setdefault(bounce.number, [])
         alike.append(bounce)
         if sum(len(part.ray) for part in alike) >= BATCH_HITS:
-            yield _joined(alike)
+            yield joined(alike)
             alike.clear()
     for alike in waiting.values():
         if alike:
-            yield _joined(alike)
+            yield joined(alike)
 
 
-def _joined(bounces: list[Bounce]) -> Bounce:
+def joined(bounces: list[Bounce]) -> Bounce:
+    """Return the hits of bounces of one number as one; their rays keep their indices."""
     if len(bounces) == 1:
         return bounces[0]
 
@@ -268,12 +273,7 @@ def aim(emitter: Floats, centre: Floats, radius: float) -> tuple[Floats, float]:
 
 
 def trace(
-    caster: RayCaster,
-    emitter: Floats,
-    directions: Floats,
-    bounces: int,
-    *,
-    solid_angle: float,
+    caster: RayCaster, emitter: Floats, directions: Floats, bounces: int, *, solid_angle: float
 ) -> Iterator[Bounce]:
     """Follow rays over mirror bounces.
 

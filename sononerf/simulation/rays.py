@@ -23,6 +23,7 @@ from sononerf.simulation.hearing import (
     Hearing,
     Listener,
 )
+from sononerf.simulation.mirror_paths import MirrorPoints, MirrorSearch
 from sononerf.simulation.paths import (
     Bounce,
     Reflection,
@@ -76,13 +77,7 @@ class Rays:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        hearing: Hearing,
-        *,
-        rays: int,
-        bounces: int,
-        band: Floats | None = None,
+        self, scene: Scene, hearing: Hearing, *, rays: int, bounces: int, band: Floats | None = None
     ) -> None:
         self.scene, self.hearing = scene, hearing
         self.reflections: tuple[Reflection, ...] = tuple(
@@ -96,7 +91,8 @@ class Rays:
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
         self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
         corners = vertices[np.asarray(scene.mesh.faces)]
-        self._balls = enclosing_balls(corners, bodies(scene.mesh), ENCLOSING_BALLS)
+        self._body = bodies(scene.mesh)
+        self._balls = enclosing_balls(corners, self._body, ENCLOSING_BALLS)
         self._farthest = max(
             math.inf if of_part.material.lobe_width else SILENT_EXPONENT / float(of_part.fade.min())
             for of_part in self.reflections
@@ -112,10 +108,12 @@ class Rays:
         self._basis = self._hats * factor[:, None]
         # The part that a shadow turns in phase is imaginary, so it is an odd function of frequency.
         odd_hats = synthesis.odd_hats if band is None else synthesis.odd_hats * band[:, None]
+        self._odd_hats = odd_hats * 1j
         self._quadrature_basis = odd_hats * (1j * factor)[:, None]
         # Rough surfaces use the filters of smooth ones, without their compensation of the fade.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
-        self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
+        self._filtered = np.abs(gain) if any_smooth else synthesis.nodes
+        self._lobed_level = synthesis.nodes / self._filtered
         wavenumber = 2.0 * math.pi / hearing.speed_of_sound * synthesis.nodes
         self._wavenumber = wavenumber.astype(np.float32)
         self._reach = max(of_part.reach for of_part in self.reflections)
@@ -125,13 +123,7 @@ class Rays:
         self._points: SurfacePoints | None = None
         self._of_image: Rays | None = None
         if hearing.head.plane is not None and hearing.image is None:
-            self._of_image = Rays(
-                scene,
-                hearing.from_image,
-                rays=rays,
-                bounces=bounces,
-                band=band,
-            )
+            self._of_image = Rays(scene, hearing.from_image, rays=rays, bounces=bounces, band=band)
 
     @property
     def rays(self) -> int:
@@ -184,12 +176,21 @@ class Rays:
         first, second = np.random.default_rng(seed).random(2)
         sound, quadrature = self.hearing.silence(), self.hearing.silence()
         shadows = self._shadows(position, rotation)
-        self._hear(sound, quadrature, self._first(position, rotation), position, rotation, shadows)
-        for bounce in gathered(self._paths(position, rotation, (first, second))):
-            self._hear(sound, quadrature, bounce, position, rotation, [])
+        bounce = self._first(position, rotation)
+        self._hear(sound, quadrature, bounce, position, rotation, shadows=shadows)
+        search = self._search(position, rotation)
+        later = list(self._paths(position, rotation, (first, second), search.sharpest))
+        for bounce in gathered(later):
+            self._hear(sound, quadrature, bounce, position, rotation, sharpest=search.sharpest)
+        mirrors, turned = self.hearing.silence(), self.hearing.silence()
+        self._hear_mirrors(mirrors, turned, search, later, position, rotation)
         echo = self.hearing.echo(sound, self._basis)
         if quadrature.heard:
             echo += self.hearing.echo(quadrature, self._quadrature_basis)
+        if mirrors.heard:
+            echo += self.hearing.echo(mirrors, self._hats)
+        if turned.heard:
+            echo += self.hearing.echo(turned, self._odd_hats)
         if self._diffracts:
             if self._diffraction is None:
                 step = EDGE_STEP * self.hearing.speed_of_sound / RESOLVED_FREQUENCY
@@ -203,8 +204,12 @@ class Rays:
     def later(self, sound: Listener, position: Floats, rotation: Floats, *, seed: int) -> None:
         """Pass the echoes of the first bounce to a listener; edges are left out."""
         first, second = np.random.default_rng(seed).random(2)
-        for bounce in gathered(self._paths(position, rotation, (first, second))):
-            self._hear(sound, sound, bounce, position, rotation, [])
+        search = self._search(position, rotation)
+        later = list(self._paths(position, rotation, (first, second), search.sharpest))
+        for bounce in gathered(later):
+            self._hear(sound, sound, bounce, position, rotation, sharpest=search.sharpest)
+        scale = 1.0 / self._filtered
+        self._hear_mirrors(sound, sound, search, later, position, rotation, scale=scale)
         if self._of_image is not None:
             self._of_image.later(sound, position, rotation, seed=seed)
 
@@ -249,7 +254,7 @@ class Rays:
         return self.caster.visible(bounce.points, emitter, normals=bounce.flat)
 
     def _paths(
-        self, position: Floats, rotation: Floats, offset: tuple[float, float]
+        self, position: Floats, rotation: Floats, offset: tuple[float, float], sharpest: float
     ) -> Iterator[Bounce]:
         if self.bounces < 2:
             return iter(())
@@ -262,7 +267,7 @@ class Rays:
         listeners = self._listeners(position, rotation)
 
         def judge(bounce: Bounce) -> tuple[Bools, Floats]:
-            return self._audibility.judge(bounce, listeners)
+            return self._audibility.judge(bounce, listeners, sharpest)
 
         index = self._reaching(cap, emitter)
         return echo_paths(
@@ -298,13 +303,16 @@ class Rays:
         bounce: Bounce,
         position: Floats,
         rotation: Floats,
-        shadows: list[Shadow],
+        *,
+        shadows: list[Shadow] | None = None,
+        sharpest: float = math.inf,
     ) -> None:
+        """Pass what the ears hear of a bounce on; paths sharper than ``sharpest`` are left out."""
+        heard_by = []
         is_lit = self._lit(bounce, position, rotation) if shadows else None
-        heard_by = [
-            self._heard(bounce, place, is_lit, *((shadows[0], shadows[1 + ear]) if shadows else ()))
-            for ear, place in enumerate(self.hearing.places(position, rotation)[1])
-        ]
+        for ear, place in enumerate(self.hearing.places(position, rotation)[1]):
+            dim = (shadows[0], shadows[1 + ear]) if shadows else ()
+            heard_by.append(self._heard(bounce, place, sharpest, is_lit, *dim))
         anyone = np.zeros(len(bounce.ray), dtype=bool)
         for heard, _, _, _ in heard_by:
             anyone[heard] = True
@@ -326,10 +334,89 @@ class Rays:
                 shaded=None if shaded is None else (quadrature, *shaded),
             )
 
+    def _hear_mirrors(
+        self,
+        sound: Listener,
+        turned: Listener,
+        search: MirrorSearch,
+        later: list[Bounce],
+        position: Floats,
+        rotation: Floats,
+        *,
+        scale: Floats | float = 1.0,
+    ) -> None:
+        """Pass the echoes of mirror paths over several bounces, times ``scale`` (F,), on.
+
+        The part that is turned in phase goes to ``turned``.
+        """
+        ears = self.hearing.places(position, rotation)[1]
+        listeners = self._listeners(position, rotation)
+        nearest = np.linalg.norm(ears[:, None] - listeners, axis=2).argmin(axis=1)
+        for place, listener in enumerate(listeners):
+            for number, starts in search.starts(later, listener, self._body).items():
+                middle = search.refine(number, starts, listener)
+                if middle is None:
+                    continue
+                for ear in np.flatnonzero(nearest == place):
+                    mirrors = search.refine(number, middle.bounce.emitted, ears[ear])
+                    if mirrors is not None:
+                        echoes = sound, turned, scale
+                        self._hear_mirror_points(mirrors, int(ear), position, rotation, echoes)
+
+    def _hear_mirror_points(
+        self,
+        mirrors: MirrorPoints,
+        ear: int,
+        position: Floats,
+        rotation: Floats,
+        echoes: tuple[Listener, Listener, Floats | float],
+    ) -> None:
+        sound, turned, scale = echoes
+        place, bounce = self.hearing.places(position, rotation)[1][ear], mirrors.bounce
+        seen = self.caster.visible(bounce.points, place, normals=bounce.flat)
+        seen &= np.einsum("nd,nd->n", place - bounce.points, bounce.flat) > 0.0
+        bounce = bounce[np.flatnonzero(seen)]
+        amplitude = self.hearing.speed_of_sound / mirrors.root[seen] / bounce.solid_angle
+        level = self.hearing.beam(bounce.emitted, rotation) * self._level(bounce)
+        level *= self._strength(bounce.triangles[:, -1]) * amplitude[:, None] * scale
+        phase = np.array([1.0, 1j, -1.0], np.complex64)[mirrors.negative[seen]]
+        self.hearing.add(
+            sound,
+            ear,
+            bounce.points,
+            length=bounce.length + mirrors.longer[seen],
+            spread=np.zeros(len(phase)),
+            level=level,
+            position=position,
+            rotation=rotation,
+            shaded=(turned, np.arange(len(phase)), phase[:, None]),
+        )
+
+    def _strength(self, triangle: Ints) -> Floats:
+        """Strength (N, F) of triangles (N,) towards the mirror direction."""
+        part, curvature = self._part(triangle), self.caster.curvature[triangle]
+        strength = np.zeros((len(triangle), len(self.hearing.synthesis.nodes)))
+        for index, of_surface in enumerate(self.reflections):
+            chosen = part == index
+            strength[chosen] = of_surface.strength_at(curvature[chosen])
+        return strength
+
+    def _search(self, position: Floats, rotation: Floats) -> MirrorSearch:
+        emitter, _ = self.hearing.places(position, rotation)
+        _, half_angle = aim(emitter, self._centre, self._radius)
+        whole = self.rays - round(self.rays * DIVIDED_SHARE)  # rays that are not divided
+        return MirrorSearch(
+            self.caster,
+            emitter,
+            wavenumber=self._audibility.wavenumber,
+            solid_angle=4.0 * math.pi * math.sin(half_angle / 2.0) ** 2 / whole,
+        )
+
     def _heard(
         self,
         bounce: Bounce,
         ear: Floats,
+        sharpest: float = math.inf,
         is_lit: Bools | None = None,
         lit: Shadow | None = None,
         shadow: Shadow | None = None,
@@ -340,6 +427,7 @@ class Rays:
         """
         paths = bounce.paths_to(ear)
         heard = (paths.rise > 0.0) & (paths.detour < self._farthest)
+        heard &= paths.softness <= sharpest
         if self._reach < math.pi:
             heard &= paths.cosine > math.cos(self._reach)
         near = np.flatnonzero(heard)

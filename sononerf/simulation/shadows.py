@@ -329,8 +329,8 @@ def passing(
 ) -> tuple[Bools, Ints, NDArray[np.complex64]]:
     """Return the transmission past obstacles on the ways to points and on from there.
 
-    In: lit, heard (N,), lit_table, heard_table (C, F), is_lit, is_seen (N,). Out: passes (N,), dim (M,),
-    passed (M, F).
+    In: lit, heard (N,), lit_table, heard_table (C, F), is_lit, is_seen (N,). Out: passes (N,), dim
+    (M,), passed (M, F).
     """
     frequencies = lit_table.shape[1]
     passes = np.zeros(len(lit), np.bool_)

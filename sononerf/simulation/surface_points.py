@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from sononerf.geometry.meshes import bodies
-from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats, Ints
 from sononerf.simulation.footprint import Footprint, emit_bundles, land
 from sononerf.simulation.paths import Bounce
@@ -51,7 +51,7 @@ class SurfacePoints:
         volume = np.einsum("td,td->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
         inside_out = np.bincount(body, volume)[body] < 0.0
         self._outside = np.where(closed, np.where(inside_out, -1.0, 1.0), 0.0)
-        size = _cell_sizes(caster.curvature, np.asarray(mesh.area_faces), wavelength)
+        size: Floats = _cell_sizes(caster.curvature, np.asarray(mesh.area_faces), wavelength)
         longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
         parts = np.maximum(np.ceil(PIECES * longest / size), 1.0).astype(np.int64)
         owner, middle = _divided(corners, parts)
@@ -62,10 +62,10 @@ class SurfacePoints:
         # Counted from the middle: the same for a scene turned by a right angle, or mirrored.
         off = middle - 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))
         at = np.floor(off / size[owner, None] + 0.5).astype(np.int64)
-        keys = np.column_stack([at, np.round(np.log2(size / wavelength))[owner], body[owner], faces])
-        _, cell = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)
-        cell = cell.ravel()
-        whole = np.bincount(cell, area)
+        halved = np.round(np.log2(size / wavelength))[owner]
+        keys = np.column_stack([at, halved, body[owner], faces])
+        cell: Ints = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+        whole = np.bincount(cell, area).astype(np.float64)
         weight = np.maximum(whole, 1e-300)
         centre = np.stack([np.bincount(cell, area * part) / weight for part in middle.T], axis=1)
         distance = np.square(middle - centre[cell]).sum(axis=1)
@@ -73,7 +73,7 @@ class SurfacePoints:
         nearest = order[np.flatnonzero(np.diff(cell[order], prepend=-1))]
         kept = np.flatnonzero(whole > 0.0)
         self._hits = caster.on_triangles(centre[kept], owner[nearest[kept]])
-        self.area: Floats = whole[kept]
+        self.area = whole[kept]
 
     def lit_from(self, emitter: Floats) -> Bounce:
         """Return the first bounce at all points whose outside faces an emitter (3,), m."""
@@ -85,11 +85,12 @@ class SurfacePoints:
         length = np.sqrt(np.einsum("nd,nd->n", onward, onward))
         onward /= length[:, None]
         triangle = hits.triangle.take(facing)
-        normals, flat, gradients = (
-            part.take(facing, axis=0) for part in (hits.normals, hits.flat, hits.gradients)
-        )
         rows, _, flat, mirrored = land(
-            emit_bundles(onward, length), onward, normals, flat, gradients
+            emit_bundles(onward, length),
+            onward,
+            hits.normals.take(facing, axis=0),
+            hits.flat.take(facing, axis=0),
+            hits.gradients.take(facing, axis=0),
         )
         solid_angle = np.abs(sink) / length**3 * self.area.take(facing)
         return Bounce(

@@ -232,9 +232,7 @@ def test_a_stretch_that_is_seen_in_part_counts_by_that_part():
     screen = box([0.2, -0.1, -0.1], [0.201, 0.0037, 0.1])
     mesh = trimesh.util.concatenate([sheet, screen])
     gate = {"since": 0.28, "until": 0.35}
-    found, fine = (
-        spectrum(edges_only(mesh, step=step)[0], BAND, **gate) for step in (2e-3, 2e-5)
-    )
+    found, fine = (spectrum(edges_only(mesh, step=step)[0], BAND, **gate) for step in (2e-3, 2e-5))
     np.testing.assert_allclose(found, fine, atol=0.02 * np.abs(fine).max())
 
 

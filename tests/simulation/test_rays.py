@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.poses import look_at, rotation_from_euler
+from sononerf.geometry.poses import look_at
 from sononerf.head.ears import ear_tables
 from sononerf.run.build import simulator_of
 from sononerf.scene.material import RIGID, Material
