@@ -276,7 +276,7 @@ def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) ->
     return simulator.spectrogram(position, rotation, seed=seed)
 
 
-FIRST_RAYS = 5_000
+FIRST_RAYS = 10_000
 """Rays per pose of the first trial. Fewer rays hardly save time."""
 MAX_RAYS = 300_000
 """Largest number of rays per pose that the search for an accuracy takes. Sound that bounces between
