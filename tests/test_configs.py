@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from sononerf.run.build import head_of, module_for
+from sononerf.run.build import module_for
+from sononerf.run.simulate import head_of
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import dump_yaml, load_settings, read_yaml, validate_settings
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,6 +53,12 @@ def _begin(settings: Settings, workers: int | None) -> None:
         begin()
 
 
+def _results(folder: Path) -> AbstractContextManager[None]:
+    from sononerf.run.build import results_folder  # which imports torch, as simulating does not
+
+    return results_folder(folder)
+
+
 @app.command()
 def simulate(
     config: Config,
@@ -80,19 +86,19 @@ def simulate(
     settings = load_settings(config, overrides or ())
     _begin(settings, workers)
     from sononerf.progress import Progress
-    from sononerf.run.build import results_folder
-    from sononerf.run.scenes import draw_ensemble
     from sononerf.run.simulate import simulate as run
 
     if workers is not None and scheduler is not None:
         raise SettingsError("--workers and --scheduler exclude each other; give one")
     # A folder that cannot be written is reported before minutes of simulation.
-    with results_folder(preview) if preview is not None else nullcontext():
+    with _results(preview) if preview is not None else nullcontext():
         store = run(
             settings, output=output, workers=workers, scheduler=scheduler, progress=Progress()
         )
         say(f"wrote {store.path} ({len(store) - len(store.missing())} poses)")
         if preview is not None:
+            from sononerf.run.scenes import draw_ensemble
+
             for path in draw_ensemble(settings, store, preview):
                 say(f"wrote {path}")
     if waveforms is not None:

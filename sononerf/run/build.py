@@ -32,11 +32,11 @@ from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import KEYS, Frame
 from sononerf.head.call import attached
 from sononerf.head.head import Head
+from sononerf.run.simulate import head_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import faults_of, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.settings.sections import LENGTHS
-from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     from sononerf.run.run import Run
@@ -145,18 +145,6 @@ def with_attached(settings: Settings, folder: Path) -> Settings:
     return settings.model_copy(update=found) if found else settings
 
 
-def head_of(settings: Settings) -> Head:
-    """Return the head that settings describe."""
-    return Head(
-        ears=settings.ears,
-        call=settings.call,
-        air=settings.air,
-        spectrogram=settings.spectrogram,
-        noise=settings.noise,
-        support=settings.support,
-    )
-
-
 def module_for(
     settings: Settings, head: Head, region: ArrayLike | None, reference: float
 ) -> EchoModule:
@@ -172,11 +160,6 @@ def module_for(
             renderer_options=settings.renderer.options,
             options=settings.fit,
         )
-
-
-def simulator_of(scene: Scene, settings: Settings) -> Simulator:
-    """Return the simulator of a scene that settings describe; see :class:`Simulator`."""
-    return Simulator(scene, head_of(settings), settings.simulation)
 
 
 @contextmanager

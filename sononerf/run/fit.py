@@ -38,12 +38,18 @@ from sononerf.geometry.poses import Poses, aim_fault
 from sononerf.numerics import Floats
 from sononerf.progress import Progress, duration
 from sononerf.resources import gigabytes, require_memory
-from sononerf.run.build import flat, head_of, module_for, stated_frame, with_store
+from sononerf.run.build import flat, module_for, stated_frame, with_store
 from sononerf.run.evaluate import evaluate
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import Run
-from sononerf.run.simulate import background_path, open_ensemble, open_or_simulate, store_path
+from sononerf.run.simulate import (
+    background_path,
+    head_of,
+    open_ensemble,
+    open_or_simulate,
+    store_path,
+)
 from sononerf.settings.loading import faults_of
 from sononerf.settings.schema import Settings
 

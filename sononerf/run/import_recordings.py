@@ -51,7 +51,7 @@ from sononerf.recordings.recording import (
     mixed_channels,
 )
 from sononerf.report.spectrogram_picture import pings_png
-from sononerf.run.build import head_of
+from sononerf.run.simulate import OWN_SETTINGS, head_of
 from sononerf.settings.loading import (
     apply_override,
     assignments,
@@ -70,7 +70,6 @@ READERS: dict[str, Callable[[Path, ImportSettings], Recording]] = {
     "sononerf-matlab": read_sononerf_matlab,
     "airsas": read_airsas,
 }
-OWN_SETTINGS = "import.yaml"
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.head.front_end import compress
 from sononerf.report.mesh_picture import mesh_png
 from sononerf.report.scene_picture import echo_png, scene_png
-from sononerf.run.build import simulator_of
-from sononerf.run.simulate import scene_of
+from sononerf.run.simulate import scene_of, simulator_of
 from sononerf.scene.scene import list_scenes, load_scene
 from sononerf.settings import loading
 from sononerf.settings.schema import Settings

@@ -9,15 +9,34 @@ from sononerf import storage
 from sononerf.echoes.echoes import Echoes, complete_store
 from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.recordings.recording import pose_table, wav_bytes
-from sononerf.run.build import head_of, simulator_of
-from sononerf.run.import_recordings import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import to_yaml
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation import ensemble
-from sononerf.simulation.simulator import ensemble_poses, pose_seed, settle_rays
+from sononerf.simulation.simulator import Simulator, ensemble_poses, pose_seed, settle_rays
+
+OWN_SETTINGS = "import.yaml"
+"""Settings of an import that lie beside its recordings."""
+
+
+def head_of(settings: Settings) -> Head:
+    """Return the head that settings describe."""
+    return Head(
+        ears=settings.ears,
+        call=settings.call,
+        air=settings.air,
+        spectrogram=settings.spectrogram,
+        noise=settings.noise,
+        support=settings.support,
+    )
+
+
+def simulator_of(scene: Scene, settings: Settings) -> Simulator:
+    """Return the simulator of a scene that settings describe; see :class:`Simulator`."""
+    return Simulator(scene, head_of(settings), settings.simulation)
 
 
 def echo_hash(settings: Settings, scene: Scene) -> str:

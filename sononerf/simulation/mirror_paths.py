@@ -148,9 +148,7 @@ class MirrorSearch:
         good = good[self._first_of_its_kind(bounce.emitted[good], path.greatest[good])]
         if not len(good):
             return None
-        return MirrorPoints(
-            bounce[good], path.longer[good], path.root[good], path.negative[good]
-        )
+        return MirrorPoints(bounce[good], path.longer[good], path.root[good], path.negative[good])
 
     def _first_of_its_kind(self, directions: Floats, stiffness: Floats) -> Bools:
         """Return the mask of paths (N,) that differ from all before."""

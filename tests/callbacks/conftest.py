@@ -15,8 +15,7 @@ from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import quiet_lightning
 from sononerf.field.module import EchoModule
-from sononerf.run.build import head_of
-from sononerf.run.simulate import simulate
+from sononerf.run.simulate import head_of, simulate
 from sononerf.settings.loading import validate_settings
 
 SETTINGS = {

@@ -11,7 +11,7 @@ from sononerf.field.fields import FourierField, GridField
 from sononerf.field.profile import ProfileRenderer
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.poses import look_at, rotation_from_euler
-from sononerf.run.build import head_of, simulator_of
+from sononerf.run.simulate import head_of, simulator_of
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings
 from tests.field.lobes import fill, grid

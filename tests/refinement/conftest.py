@@ -11,7 +11,7 @@ import trimesh
 from sononerf.geometry.poses import Poses
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.remesh import remesh
-from sononerf.run.build import head_of
+from sononerf.run.simulate import head_of
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation.simulator import Simulator

@@ -9,7 +9,7 @@ import trimesh
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.remesh import unit
 from sononerf.refinement.tracer import StillSurface
-from sononerf.run.build import head_of
+from sononerf.run.simulate import head_of
 from sononerf.simulation.hearing import hearing_of
 from tests.refinement.conftest import RADIUS, given
 

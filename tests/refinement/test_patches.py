@@ -11,7 +11,7 @@ from sononerf.refinement.objective import ErrorLevel, differences, measured, mis
 from sononerf.refinement.plane_descent import PlaneDescent, flattest
 from sononerf.refinement.planes import flat_parts, motions, on_patches, patches_of, planes_of
 from sononerf.refinement.remesh import distance_from
-from sononerf.run.build import head_of
+from sononerf.run.simulate import head_of
 from tests.memory import deaf_hull, echoes_of
 
 FAR = 5e-3

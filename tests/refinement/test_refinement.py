@@ -20,7 +20,7 @@ from sononerf.refinement.objective import ErrorLevel, OnsetRanges
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement
 from sononerf.refinement.remesh import distance_from, remesh
-from sononerf.run.build import head_of
+from sononerf.run.simulate import head_of
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator

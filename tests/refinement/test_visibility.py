@@ -11,7 +11,7 @@ from sononerf.refinement.descent import Descent
 from sononerf.refinement.objective import ErrorLevel, differences, measured, mismatch
 from sononerf.refinement.remesh import remesh
 from sononerf.refinement.tracer import FREE_DISTANCE, Correction, StillSurface, Tracer, seen
-from sononerf.run.build import simulator_of
+from sononerf.run.simulate import simulator_of
 from sononerf.scene.scene import Scene
 from tests.memory import changed
 from tests.refinement.conftest import RADIUS

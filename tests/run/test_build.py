@@ -24,9 +24,9 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.refinement.objective import HUBER_SCALE
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement
-from sononerf.run.build import head_of, module_for, read_truth, true_mesh, with_store
+from sononerf.run.build import module_for, read_truth, true_mesh, with_store
 from sononerf.run.fit import finish, fit
-from sononerf.run.simulate import simulate
+from sononerf.run.simulate import head_of, simulate
 from sononerf.settings.loading import load_settings, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS
 from tests.memory import echoes_of

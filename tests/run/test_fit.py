@@ -39,11 +39,11 @@ from sononerf.head.directivity_files import write_sofa
 from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
-from sononerf.run.build import head_of
 from sononerf.run.fit import LINE_WARNING, fit, fit_warnings, peak_memory_bytes
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import STAGES, Run
+from sononerf.run.simulate import head_of
 from tests.head.directivity.patterns import pair
 
 STEPS, PER_EPOCH = 12, 4

@@ -13,7 +13,7 @@ import trimesh
 
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at
-from sononerf.run.build import simulator_of
+from sononerf.run.simulate import simulator_of
 from sononerf.scene.scene import Scene, check_aim, check_positions, check_reach, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation.ensemble import simulate_ensemble

@@ -7,8 +7,7 @@ from sononerf.echoes.store import EnsembleStore, chunk_path
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import Ears
 from sononerf.progress import Progress
-from sononerf.run.build import simulator_of
-from sononerf.run.simulate import simulate
+from sononerf.run.simulate import simulate, simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation import simulator as module

@@ -9,7 +9,7 @@ import trimesh
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import ear_tables
-from sononerf.run.build import simulator_of
+from sononerf.run.simulate import simulator_of
 from sononerf.scene.material import RIGID, Material
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import EarSettings

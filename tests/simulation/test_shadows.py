@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.run.build import simulator_of
+from sononerf.run.simulate import simulator_of
 from sononerf.scene.material import RIGID
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings

@@ -13,7 +13,7 @@ from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.head.directivity_files import write_sofa
 from sononerf.head.front_end import compress
 from sononerf.head.reception import air_absorption
-from sononerf.run.build import simulator_of
+from sononerf.run.simulate import simulator_of
 from sononerf.scene.material import RIGID, Material
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings

@@ -19,7 +19,7 @@ Magnitude = NDArray[np.float64]
 
 def exact(arguments: argparse.Namespace) -> str:
     """Compare the simulator with frozen solutions of the wave equation, by band."""
-    from sononerf.run.build import simulator_of
+    from sononerf.run.simulate import simulator_of
     from sononerf.settings.loading import validate_settings
     from tests.simulation import judges
 

@@ -33,8 +33,7 @@ from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.field.renderer import ShellRenderer
 from sononerf.progress import Progress
-from sononerf.run.build import head_of
-from sononerf.run.simulate import default_store, echo_hash, open_or_simulate
+from sononerf.run.simulate import default_store, echo_hash, head_of, open_or_simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from sononerf.settings.schema import Settings
