@@ -112,6 +112,19 @@ class MirrorSearch:
             by_number.setdefault(bounce.number, []).append(bounce.emitted[near])
         return {number: np.concatenate(parts) for number, parts in by_number.items()}
 
+    def both_ways(self, number: int, directions: Floats, listener: Floats) -> MirrorPoints | None:
+        """Return the mirror points that are reached from some directions (N, 3), or backwards.
+
+        A listener close to the emitter hears each path in both directions. Where it is far, the
+        way back is no more than a place to start from.
+        """
+        there = self.refine(number, directions, listener)
+        if there is None:
+            return None
+        back = there.bounce.points - self._emitter
+        back /= np.linalg.norm(back, axis=1, keepdims=True)
+        return self.refine(number, np.concatenate([there.bounce.emitted, back]), listener)
+
     def refine(self, number: int, directions: Floats, listener: Floats) -> MirrorPoints | None:
         """Return the mirror points that Newton's method finds from some directions (N, 3)."""
         longest = LONGEST_STEP * math.sqrt(self._solid_angle)

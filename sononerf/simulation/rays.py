@@ -354,7 +354,7 @@ class Rays:
         nearest = np.linalg.norm(ears[:, None] - listeners, axis=2).argmin(axis=1)
         for place, listener in enumerate(listeners):
             for number, starts in search.starts(later, listener, self._body).items():
-                middle = search.refine(number, starts, listener)
+                middle = search.both_ways(number, starts, listener)
                 if middle is None:
                     continue
                 for ear in np.flatnonzero(nearest == place):
