@@ -103,7 +103,7 @@ def covered(
 
 logger = logging.getLogger("sononerf")
 
-RAYS = 100_000
+RAYS = 20_000
 """Rays per pose. Echoes of the true three spheres differ from those of 300,000 rays by 0.1 dB over
 active cells; with 30,000 rays by 0.2 dB."""
 GAIN_POSES = 12

@@ -39,7 +39,7 @@ from sononerf.start.surface import Surface, finished_surface
 
 UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
 """Start methods in order: without refinement the first that gives a surface is taken."""
-RAYS = 20_000
+RAYS = 10_000
 """Rays per pose, for the correction of the last stage."""
 
 

@@ -110,18 +110,34 @@ def _derivatives(
 
 
 @compiled
-def path_derivatives(
-    rows: Singles, points: Floats, flat: Floats, mirrored: Floats, listener: Floats
+def expand_paths(
+    rows: Singles, points: Floats, flat: Floats, mirrored: Floats, listeners: Floats, which: Ints
 ) -> Floats:
-    """Return distance, cosine, rise, both slopes and second derivatives 11, 22, 12 (8, H) of paths.
+    """Expand paths to second order about their rays, as :func:`paths_to`, over u and v.
 
-    As :func:`paths_to`, over u and v.
+    In: rows ((H, 19) float32), points, flat, mirrored (H, 3), listeners ((L, 3), m), which (H,).
+    Out: values (8, H): step to the mirror point by u and v (rad), an upper bound of the difference
+    to the path by it (m), by how much that is longer (m), root of the determinant of the Hessian,
+    its number of negative eigenvalues, and their magnitudes, the smaller and the greater (m/rad²).
     """
     values = np.zeros((8, len(rows)))
     for i in range(len(rows)):
-        one = _derivatives(rows[i], points[i], flat[i], mirrored[i], listener)
-        for k in range(8):
-            values[k, i] = one[k]
+        _, _, _, g1, g2, h11, h22, h12 = _derivatives(
+            rows[i], points[i], flat[i], mirrored[i], listeners[which[i]]
+        )
+        middle, apart = 0.5 * (h11 + h22), 0.5 * (h11 - h22)
+        half = math.sqrt(apart * apart + h12 * h12)
+        one, other = middle + half, middle - half
+        determinant = h11 * h22 - h12 * h12
+        safe = determinant if abs(determinant) > 1e-300 else 1e-300
+        u, v = (h12 * g2 - h22 * g1) / safe, (h12 * g1 - h11 * g2) / safe
+        greatest = max(abs(one), abs(other))
+        values[0, i], values[1, i] = u, v
+        values[2, i] = 0.5 * (u * u + v * v) * greatest
+        values[3, i] = 0.5 * (g1 * u + g2 * v)
+        values[4, i] = math.sqrt(abs(determinant))
+        values[5, i] = (1.0 if one < 0.0 else 0.0) + (1.0 if other < 0.0 else 0.0)
+        values[6, i], values[7, i] = min(abs(one), abs(other)), greatest
     return values
 
 

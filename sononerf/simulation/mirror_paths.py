@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 
 from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats, Ints
-from sononerf.simulation.footprint import emit_bundles, path_derivatives
+from sononerf.simulation.footprint import emit_bundles, expand_paths
 from sononerf.simulation.paths import Bounce, joined, trace
 
 MIN_TURNS = 4.0
 """Phase by which a path bends over the cell of a ray, in the direction in which it bends less, rad,
 from which the integral around its mirror point is known in closed form: the first Fresnel zone is
 then smaller than the cell."""
-ITERATIONS = 12
+ITERATIONS = 8
 """Newton steps."""
 CONVERGED = 0.02
 """Phase between a ray and the mirror path below which it is one, rad."""
@@ -37,27 +37,23 @@ far it is."""
 
 @dataclass(frozen=True, eq=False)
 class MirrorPoints:
-    """Last mirror points of paths to one listener."""
+    """Last mirror points of paths to some places."""
 
     bounce: Bounce  # The hits of rays close to them
-    longer: (
-        Floats  # (N,), m: By how much the paths are longer than by these hits; less than zero too
-    )
+    which: Ints  # (N,): Index of the place
+    longer: Floats  # (N,), m: Length of the paths less that by these hits
     root: Floats  # (N,), m/rad²: Root of the determinant of the path's second derivatives
     negative: Ints  # (N,): Number of negative eigenvalues of those derivatives
 
-
-@dataclass(frozen=True, eq=False)
-class _Expansion:
-    """A path's length about rays, to second order."""
-
-    step: Floats  # (2, N), rad: To the mirror point
-    detour: Floats  # (N,), m: Upper bound of the difference to the path by the mirror point
-    longer: Floats  # As of the mirror points
-    root: Floats
-    negative: Ints
-    least: Floats  # (N,), m/rad²: Eigenvalues' magnitudes, the smaller and the greater
-    greatest: Floats
+    def __getitem__(self, chosen: Bools) -> MirrorPoints:
+        """Return the chosen ones."""
+        return MirrorPoints(
+            self.bounce[np.flatnonzero(chosen)],
+            self.which[chosen],
+            self.longer[chosen],
+            self.root[chosen],
+            self.negative[chosen],
+        )
 
 
 class MirrorSearch:
@@ -87,88 +83,109 @@ class MirrorSearch:
         self._wavenumber, self._solid_angle = wavenumber, solid_angle
         self.sharpest = MIN_TURNS / (wavenumber * solid_angle)
 
-    def starts(self, bounces: Iterable[Bounce], listener: Floats, body: Ints) -> dict[int, Floats]:
-        """Return directions (N, 3) of rays near mirror paths, by the number of bounces.
+    def starts(
+        self, bounces: Iterable[Bounce], places: Floats, body: Ints
+    ) -> dict[int, tuple[Floats, Ints]]:
+        """Return directions (N, 3) of rays near mirror paths, and the places (N,) these lead to.
 
-        In: listener ((3,), m), body (T,): Index of each triangle's connected part.
+        In: places ((L, 3), m), body (T,): Index of each triangle's connected part. Out: by number
+        of bounces.
         """
-        by_number: dict[int, list[Floats]] = {}
+        near: dict[int, list[tuple[Floats, Ints]]] = {}
+        parts = int(body.max()) + 1
         for bounce in bounces:
-            path = self._expand(bounce, listener)
-            sharp = path.least > self.sharpest
-            off = np.hypot(*path.step)
-            side = np.sqrt(np.broadcast_to(bounce.solid_angle, off.shape))
-            near = sharp & (off < NEAR * side)
             key = body[bounce.triangles[:, 0]]
             for column in bounce.triangles.T[1:]:
-                key = key * (body.max() + 1) + body[column]
-            order = np.flatnonzero(sharp)
-            order = order[np.lexsort((path.detour[order], key[order]))]
-            new = np.diff(key[order], prepend=-1) != 0
-            since = np.arange(len(order)) - np.maximum.accumulate(
-                np.where(new, np.arange(len(order)), 0)
-            )
-            near[order[since < PER_SEQUENCE]] = True
-            by_number.setdefault(bounce.number, []).append(bounce.emitted[near])
-        return {number: np.concatenate(parts) for number, parts in by_number.items()}
+                key = key * parts + body[column]
+            side = np.sqrt(np.broadcast_to(bounce.solid_angle, len(key)))
+            for place in range(len(places)):
+                which = np.full(len(key), place)
+                u, v, detour, *_, least, _ = self._expanded(bounce, places, which)
+                sharp = least > self.sharpest
+                chosen = sharp & (np.hypot(u, v) < NEAR * side)
+                order = np.flatnonzero(sharp)
+                order = order[np.lexsort((detour[order], key[order]))]
+                count = np.arange(len(order))
+                first = np.where(np.diff(key[order], prepend=-1) != 0, count, 0)
+                chosen[order[count - np.maximum.accumulate(first) < PER_SEQUENCE]] = True
+                ray = np.flatnonzero(chosen)
+                near.setdefault(bounce.number, []).append((bounce.emitted[ray], which[ray]))
+        return {
+            number: (np.concatenate([one for one, _ in some]), np.concatenate([n for _, n in some]))
+            for number, some in near.items()
+        }
 
-    def both_ways(self, number: int, directions: Floats, listener: Floats) -> MirrorPoints | None:
-        """Return the mirror points that are reached from some directions (N, 3), or backwards.
+    def both_ways(
+        self, number: int, directions: Floats, places: Floats, which: Ints
+    ) -> MirrorPoints | None:
+        """As :meth:`refine`; also from where the paths come back to.
 
-        A listener close to the emitter hears each path in both directions. Where it is far, the
-        way back is no more than a place to start from.
+        A place close to the emitter hears each path in both directions. Where it is far, the way
+        back is no more than a direction to start from.
         """
-        there = self.refine(number, directions, listener)
+        there = self.refine(number, directions, places, which)
         if there is None:
             return None
         back = there.bounce.points - self._emitter
         back /= np.linalg.norm(back, axis=1, keepdims=True)
-        return self.refine(number, np.concatenate([there.bounce.emitted, back]), listener)
+        both = np.concatenate([there.bounce.emitted, back])
+        return self.refine(number, both, places, np.tile(there.which, 2))
 
-    def refine(self, number: int, directions: Floats, listener: Floats) -> MirrorPoints | None:
-        """Return the mirror points that Newton's method finds from some directions (N, 3)."""
+    def refine(
+        self, number: int, directions: Floats, places: Floats, which: Ints
+    ) -> MirrorPoints | None:
+        """Return the mirror points that Newton's method finds; None if there are none.
+
+        In: number: Of bounces, directions (N, 3) to start from, places ((L, 3), m), which (N,):
+        Index of the place that each leads to.
+        """
         longest = LONGEST_STEP * math.sqrt(self._solid_angle)
         start, step = directions, np.zeros((len(directions), 3))
-        done: list[Bounce] = []
+        done: list[tuple[Bounce, Ints]] = []
         for _ in range(ITERATIONS):
             if not len(start):
                 break
             now = start + step
-            now /= np.linalg.norm(now, axis=1, keepdims=True)
+            now /= np.sqrt(np.einsum("nd,nd->n", now, now))[:, None]
             bounce = self._last(now, number)
             if bounce is None:
-                step *= 0.5
+                step = 0.5 * step
                 continue
-            path = self._expand(bounce, listener)
-            near = self._wavenumber * path.detour < CONVERGED
-            done.append(bounce[np.flatnonzero(near)])
+            goal = which[bounce.ray]
+            u, v, detour, *_ = self._expanded(bounce, places, goal)
+            near = self._wavenumber * detour < CONVERGED
+            arrived, further = np.flatnonzero(near), np.flatnonzero(~near)
+            if len(arrived):
+                done.append((bounce[arrived], goal[arrived]))
             # Rays that miss go back half of the way.
             missed = np.ones(len(now), dtype=bool)
             missed[bounce.ray] = False
-            further = np.flatnonzero(~near)
-            u, v = path.step[:, further]
+            u, v = u[further], v[further]
             size = np.minimum(longest / np.maximum(np.hypot(u, v), 1e-300), 1.0)
             frame = emit_bundles(bounce.emitted[further], np.ones(len(further)))[:, 6:]
             turn = (u * size)[:, None] * frame[:, :3] + (v * size)[:, None] * frame[:, 3:]
             start = np.concatenate([now[bounce.ray[further]], start[missed]])
             step = np.concatenate([turn, 0.5 * step[missed]])
-        kept = [bounce for bounce in done if len(bounce.ray)]
-        if not kept:
+            which = np.concatenate([goal[further], which[missed]])
+        if not done:
             return None
-        bounce = joined(kept)
-        path = self._expand(bounce, listener)
-        good = np.flatnonzero(path.least > self.sharpest)
-        good = good[self._first_of_its_kind(bounce.emitted[good], path.greatest[good])]
+        bounce, which = joined([one for one, _ in done]), np.concatenate([n for _, n in done])
+        _, _, _, longer, root, negative, least, greatest = self._expanded(bounce, places, which)
+        good = np.flatnonzero(least > self.sharpest)
+        good = good[self._first_of_its_kind(bounce.emitted[good], which[good], greatest[good])]
         if not len(good):
             return None
-        return MirrorPoints(bounce[good], path.longer[good], path.root[good], path.negative[good])
+        return MirrorPoints(
+            bounce[good], which[good], longer[good], root[good], negative[good].astype(np.int64)
+        )
 
-    def _first_of_its_kind(self, directions: Floats, stiffness: Floats) -> Bools:
+    def _first_of_its_kind(self, directions: Floats, which: Ints, stiffness: Floats) -> Bools:
         """Return the mask of paths (N,) that differ from all before."""
         reach = np.sqrt(2.0 * SAME / (self._wavenumber * stiffness))
         first = np.ones(len(directions), dtype=bool)
         if len(directions) > 1:
-            pairs = cKDTree(directions).query_pairs(float(reach.max()), output_type="ndarray")
+            apart = np.column_stack([directions, 10.0 * which])  # those to other places are others
+            pairs = cKDTree(apart).query_pairs(float(reach.max()), output_type="ndarray")
             one, other = directions[pairs[:, 0]], directions[pairs[:, 1]]
             alike = np.linalg.norm(one - other, axis=1) < reach[pairs].max(axis=1)
             first[pairs[alike].max(axis=1)] = False
@@ -182,19 +199,6 @@ class MirrorSearch:
                 return bounce
         return None
 
-    def _expand(self, bounce: Bounce, listener: Floats) -> _Expansion:
-        _, _, _, g1, g2, h11, h22, h12 = path_derivatives(
-            bounce.footprint.rows, bounce.points, bounce.flat, bounce.mirrored, listener
-        )
-        middle, half = 0.5 * (h11 + h22), np.hypot(0.5 * (h11 - h22), h12)
-        one, other = middle + half, middle - half
-        determinant = h11 * h22 - h12 * h12
-        safe = np.where(np.abs(determinant) > 1e-300, determinant, 1e-300)
-        u, v = (h12 * g2 - h22 * g1) / safe, (h12 * g1 - h11 * g2) / safe
-        longer = 0.5 * (g1 * u + g2 * v)  # to second order, at the mirror point
-        low, high = np.minimum(np.abs(one), np.abs(other)), np.maximum(np.abs(one), np.abs(other))
-        detour = 0.5 * (u * u + v * v) * high
-        return _Expansion(
-            np.stack([u, v]), detour, longer, np.sqrt(np.abs(determinant)),
-            (one < 0.0).astype(np.int64) + (other < 0.0), low, high,
-        )  # fmt: skip
+    def _expanded(self, bounce: Bounce, places: Floats, which: Ints) -> Floats:
+        rows = bounce.footprint.rows
+        return expand_paths(rows, bounce.points, bounce.flat, bounce.mirrored, places, which)

@@ -352,27 +352,28 @@ class Rays:
         ears = self.hearing.places(position, rotation)[1]
         listeners = self._listeners(position, rotation)
         nearest = np.linalg.norm(ears[:, None] - listeners, axis=2).argmin(axis=1)
-        for place, listener in enumerate(listeners):
-            for number, starts in search.starts(later, listener, self._body).items():
-                middle = search.both_ways(number, starts, listener)
-                if middle is None:
-                    continue
-                for ear in np.flatnonzero(nearest == place):
-                    mirrors = search.refine(number, middle.bounce.emitted, ears[ear])
-                    if mirrors is not None:
-                        echoes = sound, turned, scale
-                        self._hear_mirror_points(mirrors, int(ear), position, rotation, echoes)
+        for number, (starts, which) in search.starts(later, listeners, self._body).items():
+            middle = search.both_ways(number, starts, listeners, which)
+            if middle is None:
+                continue
+            path, ear = np.nonzero(middle.which[:, None] == nearest)
+            mirrors = search.refine(number, middle.bounce.emitted[path], ears, ear)
+            if mirrors is not None:
+                for one in np.unique(mirrors.which):
+                    self._hear_mirror_points(
+                        mirrors[mirrors.which == one], position, rotation, (sound, turned, scale)
+                    )
 
     def _hear_mirror_points(
         self,
         mirrors: MirrorPoints,
-        ear: int,
         position: Floats,
         rotation: Floats,
         echoes: tuple[Listener, Listener, Floats | float],
     ) -> None:
-        sound, turned, scale = echoes
-        place, bounce = self.hearing.places(position, rotation)[1][ear], mirrors.bounce
+        (sound, turned, scale), bounce = echoes, mirrors.bounce
+        ear = int(mirrors.which[0])
+        place = self.hearing.places(position, rotation)[1][ear]
         seen = self.caster.visible(bounce.points, place, normals=bounce.flat)
         seen &= np.einsum("nd,nd->n", place - bounce.points, bounce.flat) > 0.0
         bounce = bounce[np.flatnonzero(seen)]

@@ -226,8 +226,11 @@ def _path_poses(settings: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.i
 
 
 MOST_WORKERS = 8
-WORTH_RAYS = 250_000
-"""Rays of all poses from which other processes save time: fewer are traced before these start."""
+POSE_RAYS = 25_000
+"""Rays that take as long as what a pose takes besides its rays."""
+WORTH_RAYS = 1_000_000
+"""Rays of all poses, with these, from which other processes save time: it takes them a second to
+start."""
 
 READY = "sononerf.simulation.ready"
 """What worker processes have imported when they start."""
@@ -240,7 +243,7 @@ SeedOf = Callable[[int], int]
 
 def useful_workers(poses: int, rays: int) -> int:
     """Return the number of processes that simulates the poses soonest; one means this process."""
-    return min(available_cores(), MOST_WORKERS) if poses * rays >= WORTH_RAYS else 1
+    return min(available_cores(), MOST_WORKERS) if poses * (rays + POSE_RAYS) >= WORTH_RAYS else 1
 
 
 def simulated(

@@ -62,9 +62,11 @@ class SurfacePoints:
         # Counted from the middle: the same for a scene turned by a right angle, or mirrored.
         off = middle - 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))
         at = np.floor(off / size[owner, None] + 0.5).astype(np.int64)
-        halved = np.round(np.log2(size / wavelength))[owner]
-        keys = np.column_stack([at, halved, body[owner], faces])
-        cell: Ints = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+        halved = np.round(np.log2(size / wavelength)).astype(np.int64)[owner]
+        cell: Ints = np.zeros(len(owner), dtype=np.int64)
+        for column in (*at.T, halved, body[owner], faces):
+            column = column - column.min()
+            cell = np.unique(cell * (column.max() + 1) + column, return_inverse=True)[1]
         whole = np.bincount(cell, area).astype(np.float64)
         weight = np.maximum(whole, 1e-300)
         centre = np.stack([np.bincount(cell, area * part) / weight for part in middle.T], axis=1)
