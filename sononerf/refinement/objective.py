@@ -268,7 +268,7 @@ ONSET_DELAY = 0.25
 Those of true bodies of bars come late by 0.14 at the median. Free surfaces follow them; counted as
 they are, they would be an error of the truth."""
 RAYS = 10_000
-"""Number of rays per validation pose; on three spheres two patterns of them differ by 0.05 dB."""
+"""Number of rays per validation pose; on three spheres two patterns of them differ by 0.2 dB."""
 
 
 class SurfaceComparison:

@@ -15,10 +15,11 @@ from sononerf.numerics import Bools, Floats, Ints
 from sononerf.simulation.footprint import emit_bundles, expand_paths
 from sononerf.simulation.paths import Bounce, joined, trace
 
-MIN_TURNS = 4.0
-"""Phase by which a path bends over the cell of a ray, in the direction in which it bends less, rad,
-from which the integral around its mirror point is known in closed form: the first Fresnel zone is
-then smaller than the cell."""
+MIN_BEND = 1e5
+"""Phase by which a path would bend over the cap under which the emitter sees the scene, in the
+direction in which it bends less, rad, from which the integral around its mirror point is taken in
+closed form: the first Fresnel zone is then a 16,000th of the cap. With less, three spheres differ
+more from exact echoes; with more, more rays are needed."""
 ITERATIONS = 8
 """Newton steps."""
 CONVERGED = 0.02
@@ -70,18 +71,19 @@ class MirrorSearch:
     with :math:`n` negative eigenvalues and the path's length :math:`L`, times the gains and
     strengths there.
 
-    In: wavenumber (rad/m), solid_angle (sr): Solid angle of a ray, emitter ((3,), m).
+    In: emitter ((3,), m), wavenumber (rad/m), cap (sr): Solid angle of all rays that start, rays:
+    Their number.
 
     Attributes:
         sharpest (m/rad²): Second derivative of a path above which it is one of these, and no sum.
     """
 
     def __init__(
-        self, caster: RayCaster, emitter: Floats, *, wavenumber: float, solid_angle: float
+        self, caster: RayCaster, emitter: Floats, *, wavenumber: float, cap: float, rays: int
     ) -> None:
         self._caster, self._emitter = caster, emitter
-        self._wavenumber, self._solid_angle = wavenumber, solid_angle
-        self.sharpest = MIN_TURNS / (wavenumber * solid_angle)
+        self._wavenumber, self._solid_angle = wavenumber, cap / rays
+        self.sharpest = MIN_BEND / (wavenumber * cap)
 
     def starts(
         self, bounces: Iterable[Bounce], places: Floats, body: Ints

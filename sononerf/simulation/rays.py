@@ -405,12 +405,12 @@ class Rays:
     def _search(self, position: Floats, rotation: Floats) -> MirrorSearch:
         emitter, _ = self.hearing.places(position, rotation)
         _, half_angle = aim(emitter, self._centre, self._radius)
-        whole = self.rays - round(self.rays * DIVIDED_SHARE)  # rays that are not divided
         return MirrorSearch(
             self.caster,
             emitter,
             wavenumber=self._audibility.wavenumber,
-            solid_angle=4.0 * math.pi * math.sin(half_angle / 2.0) ** 2 / whole,
+            cap=4.0 * math.pi * math.sin(half_angle / 2.0) ** 2,
+            rays=self.rays - round(self.rays * DIVIDED_SHARE),  # the others divide these
         )
 
     def _heard(
