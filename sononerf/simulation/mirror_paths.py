@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Paths over several mirror points of curved surfaces, path by Newton's method."""
+"""Paths over several mirror points of curved surfaces, which Newton's method finds."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class MirrorSearch:
     r"""Mirror paths from one emitter, as stationary points of the path over the ray's direction.
 
     Where a surface is so curved that the bundle of a ray is far wider than the first Fresnel zone,
-    a sum over rays would need very many of them. The integral :class:`~.rays.Rays` sums is known
-    there, by stationary phase: a mirror point with the cross-section :math:`A` (m²/sr) of the
+    a sum over rays would need very many of them. There the integral
+    that :class:`~.rays.Rays` sums is known by stationary phase: a mirror point with the cross-section :math:`A` (m²/sr) of the
     bundle, the Hessian :math:`H` of the path over the ray's direction (m/rad²), and the distance
     :math:`r_2` to the ear brings the pressure
 
@@ -120,7 +120,7 @@ class MirrorSearch:
     def both_ways(
         self, number: int, directions: Floats, places: Floats, which: Ints
     ) -> MirrorPoints | None:
-        """As :meth:`refine`; also from where the paths come back to.
+        """As :meth:`refine`, and again from the directions of the last mirror points.
 
         A place close to the emitter hears each path in both directions. Where it is far, the way
         back is no more than a direction to start from.

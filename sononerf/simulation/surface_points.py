@@ -20,8 +20,8 @@ is 7 % too quiet at 90 kHz, with half of it 2 %."""
 SMALLEST_CELL = 1.0 / 16.0
 """Least side of a cell, wavelengths: what is more curved than that asks for sends little."""
 BEND = 1.0
-"""Bend of the path over a cell by the curvature of the surface, rad; 0.25 changed echoes by 0.01
-dB."""
+"""Bend of the path over a cell by the curvature of the surface, rad; with 0.25 three
+spheres change by 0.03 dB over active cells."""
 MOST_CELLS = 200_000
 """Number of cells above which all of them are larger, so that a room fits into memory."""
 PIECES = 2
