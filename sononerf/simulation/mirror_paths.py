@@ -61,8 +61,8 @@ class MirrorSearch:
     r"""Mirror paths from one emitter, as stationary points of the path over the ray's direction.
 
     Where a surface is so curved that the bundle of a ray is far wider than the first Fresnel zone,
-    a sum over rays would need very many of them. There the integral
-    that :class:`~.rays.Rays` sums is known by stationary phase: a mirror point with the cross-section :math:`A` (m²/sr) of the
+    a sum over rays would need very many of them. There the integral that :class:`~.rays.Rays` sums
+    is known by stationary phase: a mirror point with the cross-section :math:`A` (m²/sr) of the
     bundle, the Hessian :math:`H` of the path over the ray's direction (m/rad²), and the distance
     :math:`r_2` to the ear brings the pressure
 
