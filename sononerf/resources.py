@@ -11,14 +11,21 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures import ProcessPoolExecutor as ProcessPool
 from contextlib import ExitStack, contextmanager
 from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sononerf.errors import ResourceError, SettingsError, SonoNerfError
 
@@ -28,6 +35,19 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+
+def in_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """Return the result of each part, computed in as many threads as there are cores.
+
+    It pays where the work is in NumPy or in compiled functions, beside which other threads can run.
+    """
+    with ThreadPoolExecutor(available_cores()) as pool:
+        return list(pool.map(work, parts))
 
 
 def available_memory() -> int | None:

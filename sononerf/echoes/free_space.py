@@ -22,6 +22,7 @@ from scipy import sparse
 
 from sononerf.geometry.meshes import Plane
 from sononerf.numerics import Bools, Floats, compiled
+from sononerf.resources import in_threads
 
 UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, no unit; also the
@@ -116,7 +117,8 @@ class EchoHull:
         """
         where = np.asarray(points, dtype=np.float64)
         chunk = self.chunk
-        parts = [self._clearance(where[i : i + chunk]) for i in range(0, len(where), chunk)]
+        some = [where[i : i + chunk] for i in range(0, len(where), chunk)]
+        parts = in_threads(self._clearance, some)
         if not parts:
             return np.zeros(0), np.zeros(0, dtype=np.intp)
         return np.concatenate([c for c, _ in parts]), np.concatenate([p for _, p in parts])

@@ -176,14 +176,16 @@ def lots_of(levels: RangeLevels) -> list[Ints]:
 def predicted_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) -> Singles:
     """Return the signed distance by the network, (X, Y, Z) voxels, positive outside."""
     free = free_places(hull, lattice)
-    lots = [features_of(levels, some, hull, lattice, free) for some in lots_of(levels)]
+    lots = lots_of(levels)
     passes = max(len(FRAMES), len(lots))
-    total, times = np.zeros((len(lots), *lattice.shape), np.float32), np.zeros(len(lots))
-    for number in range(passes):
-        lot, frame = number % len(lots), FRAMES[number % len(FRAMES)]
-        total[lot] += _in_frame(lots[lot], *frame)
-        times[lot] += 1
-    return np.asarray((total / times[:, None, None, None]).mean(axis=0), dtype=np.float32)
+    mean = np.zeros(lattice.shape, np.float32)
+    for first, some in enumerate(lots):
+        places = features_of(levels, some, hull, lattice, free)
+        numbers = range(first, passes, len(lots))
+        for number in numbers:
+            frame = FRAMES[number % len(FRAMES)]
+            mean += _in_frame(places, *frame) / np.float32(len(lots) * len(numbers))
+    return mean
 
 
 def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, ...]) -> Singles:
