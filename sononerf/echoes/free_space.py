@@ -22,7 +22,7 @@ from scipy import sparse
 
 from sononerf.geometry.meshes import Plane
 from sononerf.numerics import Bools, Floats, compiled
-from sononerf.resources import in_threads
+from sononerf.resources import available_cores, in_threads
 
 UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, no unit; also the
@@ -116,7 +116,7 @@ class EchoHull:
         out and below the support, plus infinity without evidence; pose (N,).
         """
         where = np.asarray(points, dtype=np.float64)
-        chunk = self.chunk
+        chunk = max(self.chunk // available_cores(), 1)  # all threads together hold one chunk
         some = [where[i : i + chunk] for i in range(0, len(where), chunk)]
         parts = in_threads(self._clearance, some)
         if not parts:
