@@ -25,13 +25,13 @@ from sononerf.errors import NumericalError, StoppedError
 from sononerf.field.datamodule import WholePoses
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule, decibels
+from sononerf.field.read_out import energy_volume
 from sononerf.geometry.lattice import Volume, automatic_level, isosurface
 from sononerf.progress import Task
 from sononerf.report.figure import png_from_pixels
 from sononerf.report.mesh_picture import decimated
 from sononerf.report.mip_picture import maximum_intensity_projections, mip_image, mips_image
 from sononerf.report.spectrogram_picture import quick_image, sounding_slice
-from sononerf.start.read_out import energy_volume
 from sononerf.start.surface import mesh_bytes
 
 

@@ -88,9 +88,8 @@ def check_field(field: str | FieldFactory, **options: Any) -> Field:
     outside = places + 1.0
     _holds(not bool(made(outside, directions).abs().any()), "it is not zero outside the region")
     _has_gradients(values, made)
-    energy, axis = made.oriented(places, 20)
+    energy = made.energy(places, 20)
     _shape(energy, (POINTS,), "energy")
-    _shape(axis, (POINTS, 3), "axis")
     _holds(bool((energy >= 0).all()), "an energy is negative")
     _shape(made.loudness(places, 20), (POINTS,), "loudness")
     audible = made.audible(places, places[:3] + 0.3)

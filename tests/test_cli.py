@@ -311,9 +311,9 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     said = json.loads((tmp_path / "coarse" / "read_out.json").read_text())
     assert (said["spacing_m"], said["level"]) == (pytest.approx(0.012), pytest.approx(0.4))
     assert said["method"] == "isosurface"
-    done("reconstruct", "runs/smoke", "--method", "hull", "--output", tmp_path / "hull")
-    said = json.loads((tmp_path / "hull" / "read_out.json").read_text())
-    assert (said["method"], said["level"], said["refined"]) == ("hull", None, False)
+    done("reconstruct", "runs/smoke", "--no-refine", "--output", tmp_path / "start")
+    said = json.loads((tmp_path / "start" / "read_out.json").read_text())
+    assert (said["method"], said["level"], said["refined"]) == ("levels", None, False)
     assert tree(at_home.run) == before
 
 
@@ -661,8 +661,8 @@ def test_a_run_has_a_page(at_home, tmp_path):
 
 
 def test_only_an_isosurface_has_a_level(smoke, clean):
-    options = ("--method", "filled", "--level", "0.4", "--output", "out")
-    assert "method filled has no level" in refused(2, "reconstruct", smoke.run, *options)
+    options = ("--method", "levels", "--level", "0.4", "--output", "out")
+    assert "method levels has no level" in refused(2, "reconstruct", smoke.run, *options)
     assert tree(clean) == {}
 
 

@@ -74,8 +74,8 @@ def test_echoes_alone_give_a_surface(made):
     assert np.median(off) < echoes.head.resolution / 2
     assert len(surface.confidence) == len(surface.mesh.vertices)
     assert surface.confidence.max() > 0
-    with pytest.raises(SettingsError, match="method open needs a fitted model"):
-        sn.reconstruct(echoes, options={"method": "open"})
+    with pytest.raises(SettingsError, match="method isosurface needs a fitted model"):
+        sn.reconstruct(echoes, options={"method": "isosurface"})
     with pytest.raises(InputError, match="give the echoes that the model was fitted to"):
         sn.reconstruct(model)
 

@@ -146,8 +146,8 @@ def row(name, levels, other, result, calls=400):
     return {
         "name": name,
         "calls": calls,
-        "starts": {"open": score(0.5), "levels": score(levels)},
-        "refined": {"open": score(other), "levels": score(levels + 0.1)},
+        "starts": {"fuller": score(0.5), "levels": score(levels)},
+        "refined": {"fuller": score(other), "levels": score(levels + 0.1)},
         "result": score(result),
         "chosen": "levels",
         "kept": result != levels,
@@ -160,7 +160,7 @@ def test_the_table_shows_starts_candidates_and_result_and_what_a_right_choice_wo
     rows = [row("a", 0.7, 0.9, 0.8), row("b", 0.6, 0.4, 0.6), row("c", 0.2, 0.1, 0.3, calls=25)]
     lines = [line.split() for line in foreign.table(rows).splitlines() if line]
     first, second, median, least = lines[1:5]
-    # levels, open; refined the same; best, result, F 5mm, mm, parts, true, s, chosen
+    # levels, fuller; refined the same; best, result, F 5mm, mm, parts, true, s, chosen
     assert first[:5] == ["a", "0.70", "0.50", "0.80", "0.90"]
     assert first[5:] == ["0.90", "0.80", "1.00", "1.20", "2", "1", "60", "levels"]
     assert second[-2:] == ["levels,", "unrefined"]
@@ -194,14 +194,14 @@ def test_of_each_start_the_surface_with_the_lowest_objective_counts():
         return {"vertices": corners, "faces": faces, "objective": torch.tensor(objective)}
 
     saved = {
-        "open-blurred-0": stage(2.0, 0.0),
-        "open-blurred-1": stage(1.0, 1.0),
+        "fuller-blurred-0": stage(2.0, 0.0),
+        "fuller-blurred-1": stage(1.0, 1.0),
         "levels-planes-0": stage(3.0, 2.0),
         "levels-blurred-0": stage(4.0, 3.0),
     }
     best = foreign.best_of(saved)
     assert {name: mesh.vertices[0, 2] for name, mesh in best.items()} == {
-        "open": 1.0,
+        "fuller": 1.0,
         "levels": 2.0,
     }
 

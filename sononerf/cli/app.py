@@ -30,7 +30,7 @@ app = typer.Typer(
 
 
 Accelerator = Literal["auto", "cpu", "gpu"]
-SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "levels", "isosurface"]
+SurfaceMethod = Literal["levels", "isosurface"]
 Registration = Literal["none", "rigid", "similarity"]
 Exported = Literal["auto", "echoes", "prediction", "volume", "mesh"]
 FrameName = Literal["auto", "world", "original"]

@@ -262,7 +262,7 @@ def reconstruct(
             "has one value. auto: the best of the first five, refined."
         ),
     ] = None,
-    refine: Annotated[bool | None, typer.Option(help="Refine; auto alone is by default.")] = None,
+    refine: Annotated[bool | None, typer.Option(help="Refine; by default levels alone.")] = None,
     level: Annotated[
         str | None,
         typer.Option(
@@ -272,7 +272,7 @@ def reconstruct(
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
     accelerator: OnWhat = "auto",
 ) -> None:
-    """Read mesh, volume and projections out of a fitted field, and refine the mesh."""
+    """Make mesh, volume and projections of a run, and refine the mesh."""
     import math
     from typing import Literal
 

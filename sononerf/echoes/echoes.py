@@ -331,6 +331,11 @@ class Echoes(NotebookRepr):
         return EchoRegion(self.onsets, self.hull, self.head.gains, rotations, self.head.resolution)
 
     @cached_property
+    def bounds(self) -> Floats:
+        """Lower and upper corner of where the body is, (2, 3) m: the box, or that of the region."""
+        return self.region.box() if self.box is None else self.box
+
+    @cached_property
     def levels(self) -> RangeLevels:
         """Levels of the training poses over range; of some of them where there are many."""
         head, all_ = self.head, self.onsets.poses

@@ -225,8 +225,8 @@ class Field(nn.Module):
         return directions[2]
 
     @torch.no_grad()
-    def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:
-        """Return each place's energy over all directions and the axis it reflects along.
+    def energy(self, positions: Tensor, directions: int) -> Tensor:
+        """Return each place's energy over all directions.
 
         Args:
             positions ((N, 3), m): Places, world frame.
@@ -234,18 +234,13 @@ class Field(nn.Module):
 
         Returns:
             energy (N,): Mean over directions of the power summed over frequencies.
-            axis (N, 3): Unit vector, the energy-weighted mean direction; zero where there is none.
         """
         lattice = sphere_directions(directions, positions)
         energy = positions.new_zeros(positions.shape[0])
-        moment = torch.zeros_like(positions)
         for direction in lattice:
             response = self.select(positions, direction.expand(positions.shape), None)
-            power = response.abs().square().sum(dim=-1)
-            energy += power / directions
-            moment += power[:, None] * direction / directions
-        length = moment.norm(dim=-1, keepdim=True)
-        return energy, torch.where(length > 0, moment / length.clamp_min(1e-30), 0.0)
+            energy += response.abs().square().sum(dim=-1) / directions
+        return energy
 
     @torch.no_grad()
     def loudness(self, positions: Tensor, directions: int) -> Tensor:

@@ -170,8 +170,8 @@ class LobeField(Field):
         return response.reshape(*shape[:-1], response.shape[-1])
 
     @torch.no_grad()
-    def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:
-        r"""Return energy and axis of the lobe alone, exact where a lattice would be too coarse.
+    def energy(self, positions: Tensor, directions: int) -> Tensor:
+        r"""Return the energy of the lobe, exact where a lattice would be too coarse.
 
         The mean over the sphere of :math:`e^{2k(\cos - 1)}` is :math:`(1 - e^{-4k})/(4k)`.
         """
@@ -183,5 +183,4 @@ class LobeField(Field):
         mean = torch.where(concentration > 1e-6, mean, torch.ones_like(mean))
         strength = lobes.strength.clamp_min(LOG_STRENGTH_FLOOR)
         power = (2 * (strength + self._spectrum(lobes.own, slice(None)))).exp() * mean
-        energy = power.sum(0) * self.inside(positions)
-        return energy, (lobes.vector / length.clamp_min(1e-12)).T
+        return power.sum(0) * self.inside(positions)

@@ -180,7 +180,7 @@ class ProfileRenderer(Renderer):
         self.spacing = self.spacing.new_tensor(spacing)
 
     def _prune(self, field: Field) -> None:
-        energy = field.oriented(self.lattice[self.kept], 32)[0]
+        energy = field.energy(self.lattice[self.kept], 32)
         self.energy = torch.zeros_like(self.energy).masked_scatter(self.kept, energy)
         # The strongest of the surroundings, judged on coarse cubes and their neighbours, so
         # that far and weak parts are not starved by a loud one.

@@ -9,18 +9,16 @@ the surface (a Sobolev gradient). Section 5 of ``docs/method.md``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.free_space import EchoHull
 from sononerf.geometry.raycast import Occlusion
 from sononerf.numerics import Floats
 from sononerf.refinement.objective import (
@@ -34,8 +32,7 @@ from sononerf.refinement.objective import (
 from sononerf.refinement.optics import Heard, Optics
 from sononerf.refinement.remesh import MeshOperators, distance_from, smoothing_passes, unit
 from sononerf.refinement.tracer import Correction, LaterBounces, StillSurface, listen, sight_of
-from sononerf.start.read_out import LEVELS, StartMethod
-from sononerf.start.surface import judge_openness
+from sononerf.start.surface import StartMethod
 
 POSES = 8
 """Number of training poses per step."""
@@ -75,7 +72,6 @@ class Descent:
         later: LaterBounces | None = None,
         correction: Correction | None = None,
         onsets: OnsetRanges | None = None,
-        sheet: bool = False,
         band: float = 0.0,
         seed: int,
     ) -> None:
@@ -99,7 +95,6 @@ class Descent:
         self.rate, self.band = rate, band
         if optics.plane is not None:  # no vertex goes below it, and vertices on it stay there
             self._stands = optics.plane.height(self.vertices) < STANDING_HEIGHT * edge
-        self._sides = Sides(mesh, MIN_THICKNESS * optics.wavelength) if sheet else None
 
     def mesh(self) -> trimesh.Trimesh:
         """Return the present surface."""
@@ -124,8 +119,6 @@ class Descent:
         move = self.operators.smoothed(move, self.strength)
         self.vertices = self.vertices - rate * move.clamp(-4.0, 4.0) * normals
         self.vertices = self.operators.relaxed(self.vertices, normals, TANGENTIAL_FRACTION)
-        if self._sides is not None:
-            self.vertices = self._sides.apart(self.vertices, normals)
         if (plane := self.optics.plane) is not None:
             height = plane.height(self.vertices)
             off = torch.where(self._stands, height, height.clamp_max(0.0))[:, None]
@@ -193,36 +186,6 @@ def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Te
     return count
 
 
-MIN_THICKNESS = 0.15
-"""Least thickness of a sheet, shortest wavelengths. A thinner one sounds the same, but its sides
-could change places, and each would hide the other."""
-_OPPOSED = -0.5  # cosine between the normals of two sides, at most
-_AROUND = 16  # number of vertices among which the opposite one is searched for
-
-
-class Sides:
-    """Opposite vertices of a sheet; those of the rim have no partner. In: least (m)."""
-
-    def __init__(self, mesh: trimesh.Trimesh, least: float) -> None:
-        places, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
-        _, near = cKDTree(places).query(places, k=min(_AROUND, len(places)))
-        opposed = np.einsum("vkd,vd->vk", normals[near], normals) < _OPPOSED
-        some = np.flatnonzero(opposed.any(axis=1))
-        self._vertex = torch.as_tensor(some)
-        self._other = torch.as_tensor(near[some, opposed[some].argmax(axis=1)])
-        self._least = least
-
-    def apart(self, vertices: Tensor, normals: Tensor) -> Tensor:
-        """Return the vertices (V, 3), moved outward where the sides are too close.
-
-        In: vertices ((V, 3), m), normals (V, 3).
-        """
-        one, other = (part.to(vertices.device) for part in (self._vertex, self._other))
-        gap = ((vertices[one] - vertices[other]) * normals[one]).sum(1, keepdim=True)
-        short = (self._least - gap).clamp_min(0.0)
-        return vertices.index_add(0, one, 0.5 * short * normals[one])
-
-
 @dataclass(frozen=True)
 class Stage:
     """One stage; lengths in the shortest wavelength of the analysed band."""
@@ -258,16 +221,12 @@ Blur removes dents and necks, but also edges, sheets and wires."""
 
 CHANCE_RATIO = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
-a sheet goes on after the first stage, or else the preferred schedule. A refined surface is
-preferred to its start within it: a start that was made from the onsets fits them even where it is
-wrong."""
+a refined surface is preferred to its start."""
 RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
 are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
-too (``docs/notes/surface.md``). So above it a torn surface loses against its start. A closed
-candidate wins against one that is not closed. Within ``CHANCE_RATIO``, ``levels`` is preferred to
-the other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
-earliest one within ``CHANCE_RATIO`` of the best is kept."""
+too (``docs/notes/surface.md``). So above it a torn surface loses against its start, and of the
+surfaces of ``levels`` the earliest one within ``CHANCE_RATIO`` of the best is kept."""
 SAME_SURFACE_DISTANCE = 1 / 16
 """Mean distance below which two surfaces sound alike, shortest wavelengths: the path there and back
 counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
@@ -275,11 +234,10 @@ LATER_STAGE_RATIO = 1.03
 """Ratio of two objectives of one candidate below which the later stage is preferred: on smooth
 bodies later stages are nearer to the truth at the same objective. Edges lose in later stages, and
 there the objective rises by 5 % and more (beaker, star)."""
-Schedule = Literal["blurred", "sharp", "sheet", "planes"]
+Schedule = Literal["blurred", "sharp", "planes"]
 """How a surface goes through the stages. ``blurred``: with the blur and the edges of each stage,
-unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``sheet``:
-its triangles are kept, because a signed distance on voxels would tear it. ``planes``: its flat
-parts move as planes, and are found anew in each stage."""
+unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``planes``:
+its flat parts move as planes, and are found anew in each stage."""
 
 
 @dataclass(eq=False)
@@ -339,18 +297,15 @@ def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 
 
 def planned(
-    starts: Mapping[StartMethod, float], *, flat: bool = False
+    starts: Iterable[StartMethod], *, flat: bool = False
 ) -> list[tuple[StartMethod, Schedule]]:
     """Return the start and the schedule of each candidate."""
-    others = [name for name in starts if name not in (*LEVELS, "sheet")]
-    chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
-    chosen += sorted(others, key=lambda name: starts[name])[:1]
+    chosen = list(starts)
     pairs: list[tuple[StartMethod, Schedule]] = []
     for name in chosen:
-        if not flat and (name != "levels" or "fuller" not in starts):
+        if not flat and (name != "levels" or "fuller" not in chosen):
             pairs.append((name, "blurred"))
         pairs.append((name, "sharp"))
-    pairs += [("sheet", "sheet")] if "sheet" in starts else []
     return [("levels", "planes"), *pairs] if flat else pairs
 
 
@@ -365,10 +320,8 @@ def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Cand
 
 
 def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
-    """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
-    pairs = planned(dict.fromkeys(starts, 0.0))
-    further = max(1, len({start for start, _ in pairs if start not in ("fuller", "sheet")}))
-    return len(pairs) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
+    """Return the steps of a refinement of start methods, at most, without flat parts."""
+    return len(planned(starts)) * stages[0].steps + sum(stage.steps for stage in stages[1:])
 
 
 def after_first_stage(
@@ -376,45 +329,33 @@ def after_first_stage(
 ) -> list[Candidate]:
     """Return the candidates that go on after the first stage, the best one first.
 
-    A sheet that is about as good as the best one goes on alone. Of planes and the best of the
-    others the better one goes on, in doubt both; only their errors count, because free surfaces
-    follow the onsets and planes do not. Else each start goes on by its better schedule, ``levels``
-    and ``fuller`` as one, but none that is clearly worse.
+    Of planes and the best of the others the better one goes on, in doubt both; only their errors
+    count, because free surfaces follow the onsets and planes do not.
     """
-    good = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
-    sheets = [one for one in candidates if one.schedule == "sheet"]
-    if any(one.objectives[-1] <= good for one in sheets):
-        return sheets
     if candidates[0].schedule == "planes" and len(candidates) > 1:
-        pair = [candidates[0], after_first_stage(candidates[1:], misfit)[0]]
+        pair = [candidates[0], *after_first_stage(candidates[1:], misfit)]
         errors = [one.objectives[-1] - misfit(one.meshes[-1]) for one in pair]
         first, second = np.argsort(errors, kind="stable")
         clear = CHANCE_RATIO * errors[first] < errors[second]
         return [pair[first]] if clear else [pair[first], pair[second]]
-    left = [one for one in candidates if one.schedule != "sheet"] or sheets
-    network = [one for one in left if one.start in LEVELS]
-    others = [one for one in left if one.start not in LEVELS]
-    chosen = [_better(group) for group in (network, others) if group]
-    for one in chosen:
-        if one.start == "fuller":  # it goes on as levels, and is compared with that start
-            one.start = "levels"
-            one.meshes[0] = next(each.meshes[0] for each in network if each.start == "levels")
-    chosen = [one for one in chosen if one.objectives[-1] <= good]
-    return sorted(chosen, key=lambda one: one.objectives[-1])
+    best = _better(candidates)
+    if best.start == "fuller":  # it goes on as levels, and is compared with that start
+        best.start = "levels"
+        best.meshes[0] = next(one.meshes[0] for one in candidates if one.start == "levels")
+    return [best]
 
 
 def _better(candidates: list[Candidate]) -> Candidate:
-    """Return the candidate that explains the echoes best, of one start or both of the network.
+    """Return the free candidate that explains the echoes best.
 
-    In doubt, a sharp one by the network, whose surfaces are smooth, so that blur wears edges and
-    strokes away; of these a fuller one, because gaps stay and what is too thick becomes thinner.
-    Other starts are rough, and in doubt a blurred one goes on.
+    In doubt, a sharp one, because the surfaces of the network are smooth, so that blur wears edges
+    and strokes away; of these a fuller one, because gaps stay and what is too thick becomes
+    thinner. A surface of the user's may be rough, and in doubt it goes on blurred.
     """
     near = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
 
     def order(one: Candidate) -> tuple[bool, bool, bool, float]:
-        network = one.start in LEVELS
-        unfit = (one.schedule == "blurred") == network
+        unfit = (one.schedule == "blurred") == (one.start != "given")
         return one.objectives[-1] > near, unfit, one.start == "levels", one.objectives[-1]
 
     return min(candidates, key=order)
@@ -428,48 +369,9 @@ def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
     )
 
 
-def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
-    """Return the candidate of the least objective, in doubt ``levels`` or a closed one."""
-    least = min(candidates, key=lambda one: one.objective)
-    if least.objective <= RANKS_DB or len(candidates) == 1:
-        return least
-    closed = [one for one in candidates if is_closed(one.meshes[one.best])] or candidates
-    near = CHANCE_RATIO * min(one.objective for one in closed)
-    return min(closed, key=lambda one: (one.objective > near, one.start != "levels", one.objective))
-
-
-def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:
-    """Return a test of surfaces: do they enclose a body, as far as the poses of a hull can hear?"""
-
-    def is_closed(mesh: trimesh.Trimesh) -> bool:
-        found = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)
-        return found.kind != "one-sided"
-
-    return is_closed
-
-
-def listed(
-    starts: Iterable[StartMethod],
-    compared: Mapping[StartMethod, float],
-    candidates: list[Candidate],
-    chosen: Candidate,
-) -> list[dict[str, Any]]:
-    """Return the candidates as plain data, see ``Refined.candidates``."""
-
-    def finite(value: float | None) -> float | None:
-        return value if value is not None and math.isfinite(value) else None
-
-    refined = {one.start: one.objective for one in candidates if len(one.meshes) > 1}
-    return [
-        {
-            "start": name,
-            "start_error_db": finite(compared.get(name)),
-            "error_db": finite(refined.get(name)),
-            "chosen": name == chosen.start,
-        }
-        for name in starts
-        if name != "fuller"
-    ]
+def best_of(candidates: list[Candidate]) -> Candidate:
+    """Return the candidate of the least objective."""
+    return min(candidates, key=lambda one: one.objective)
 
 
 def parts_of(mesh: trimesh.Trimesh) -> int:

@@ -10,12 +10,10 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.geometry.directions import usual_gap
 from sononerf.head.front_end import ACTIVE_DB, compress
 from sononerf.numerics import Singles
 from sononerf.refinement.optics import Heard, Optics
@@ -208,22 +206,6 @@ class OnsetRanges:
 
     def __len__(self) -> int:
         return len(self._first)
-
-    def ridges(self, hull: trimesh.Trimesh) -> float:
-        """Return the height of the ridges of a hull (m) between poses, m.
-
-        The hull is taken for a sphere's tangent planes, one for each pose that heard an onset. The
-        height is the median over the vertices: their distance from the centroid times 1/cos - 1 of
-        the angle to the nearest pose. Vertices with a larger angle than the usual gap between as
-        many random poses take no part, because no pose bounds them.
-        """
-        outward, source = hull.vertices - hull.centroid, self._emitters - hull.centroid
-        radius, poses = np.linalg.norm(outward, axis=1), np.unique(trimesh.unitize(source), axis=0)
-        near, _ = cKDTree(poses).query(trimesh.unitize(outward))
-        cosine = 1.0 - near**2 / 2.0
-        bounded = cosine > max(math.cos(usual_gap(len(poses))), 1e-9)
-        heights = radius[bounded] * (1.0 / cosine[bounded] - 1.0)
-        return float(np.median(heights)) if bounded.any() else math.inf
 
     def misfit(self, vertices: Tensor, late: float = 0.0) -> float:
         """Return the mean Huber loss of the least range; no unit; 0 without onsets.

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from contextlib import contextmanager
 from functools import partial
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,10 +15,11 @@ import trimesh
 from lightning import Fabric
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import InputError, SettingsError, expect
 from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.module import EchoModule
+from sononerf.field.read_out import energy_volume, read_isosurface
+from sononerf.geometry.lattice import Volume
 from sononerf.progress import Progress
 from sononerf.refinement.descent import number_of_steps, poses_that_hear
 from sononerf.refinement.optics import Optics
@@ -27,55 +27,30 @@ from sononerf.refinement.refine import Refinement, Saved
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import ReconstructionSettings, SimulationSettings
 from sononerf.simulation.simulator import Simulator
-from sononerf.start.read_out import (
-    LEVELS,
-    StartMethod,
-    read_echoes,
-    read_field,
-    read_isosurface,
-    start_surfaces,
-)
-from sononerf.start.surface import Surface, finished_surface
+from sononerf.start.network import levels_surfaces
+from sononerf.start.surface import LEVELS, StartMethod, Surface, surface_as_heard
 
-UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
-"""Start methods in order: without refinement the first that gives a surface is taken."""
 RAYS = 10_000
 """Rays per pose, for the correction of the last stage."""
 
 
-@overload
-def reconstruct(
-    model: EchoModule,
-    echoes: Echoes | EchoHull,
-    *,
-    options: ReconstructionSettings | Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-) -> Surface: ...
-
-
-@overload
-def reconstruct(
-    model: Echoes,
-    *,
-    options: ReconstructionSettings | Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-) -> Surface: ...
-
-
 def reconstruct(
     model: EchoModule | Echoes,
-    echoes: Echoes | EchoHull | None = None,
+    echoes: Echoes | None = None,
     *,
     options: ReconstructionSettings | Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Surface:
-    """Read a surface out of echoes, with or without a field; :func:`refine` improves it.
+    """Read a surface out of echoes; :func:`refine` improves it.
+
+    A network makes the surface of the echoes, and the field gives the volume. With the method
+    ``isosurface`` the surface is a level of the field's volume.
 
     Args:
-        model: Fitted to the echoes; or the echoes alone, from which a network makes the surface.
-        echoes: The fitted echoes, or their free space.
+        model: Fitted to the echoes; or the echoes alone.
+        echoes: The fitted echoes; an iso-surface needs none.
         options: Keys of the section ``reconstruction`` of the settings, such as ``{"spacing":
-            0.002, "method": "hull"}`` or ``{"method": "isosurface", "level": 0.5}``.
+            0.002}`` or ``{"method": "isosurface", "level": 0.5}``.
         progress: Display of progress; on stderr by default.
 
     Returns:
@@ -83,68 +58,50 @@ def reconstruct(
 
     Raises:
         SettingsError: If an option is not allowed, or the spacing is larger than the region.
-        NumericalError: If the field has no surface.
+        NumericalError: If there is no surface.
     """
     progress = progress or Progress()
     chosen = checked_section(ReconstructionSettings, options or {}, "reconstruction")
     if isinstance(model, Echoes):
-        return _without_field(model, chosen, progress)
+        if chosen.method == "isosurface":
+            raise SettingsError(
+                "method isosurface needs a fitted model; give one, or take the method levels"
+            )
+        return _of_echoes(model, progress, None)
     expect(model, EchoModule, "model")
-    if echoes is None:
-        raise InputError("echoes: missing; give the echoes that the model was fitted to")
-    hull = echoes if isinstance(echoes, EchoHull) else echoes.hull
-    heard = None if isinstance(echoes, EchoHull) else echoes
-    field = model.field
-    if chosen.level != "auto" or chosen.method == "isosurface":
-        with _shown(progress) as shown:
+    keywords: dict[str, Any] = {"spacing": chosen.spacing, "directions": chosen.directions}
+    with _shown(progress) as shown:
+        if chosen.method == "isosurface":
             mesh, volume, level = read_isosurface(
-                field,
-                spacing=chosen.spacing,
+                model.field,
                 level=chosen.level,
-                directions=chosen.directions,
                 smoothing=chosen.smoothing,
                 progress=shown,
+                **keywords,
             )
-        return Surface(mesh, volume, "isosurface", level=level, echoes=heard)
-    with _shown(progress) as shown, nullcontext() if field.costly else _one_thread():
-        reading = read_field(
-            field,
-            hull,
-            resolution=_resolution(model, heard),
-            spacing=chosen.spacing,
-            directions=chosen.directions,
-            levels=None if heard is None else heard.levels,
-            progress=shown,
-        )
-    methods = UNREFINED if chosen.method == "auto" else (chosen.method,)
-    method, mesh = next(start_surfaces(reading, methods))
-    if chosen.method != "auto":
-        reading = replace(reading, methods=LEVELS if method == "levels" else methods)
-    return finished_surface(mesh, method, reading, echoes=heard)
+            return Surface(mesh, volume, "isosurface", level=level, echoes=echoes)
+        if echoes is None:
+            raise InputError("echoes: missing; give the echoes that the model was fitted to")
+        volume = energy_volume(model.field, **keywords, progress=shown)
+    return _of_echoes(echoes, progress, volume)
 
 
-def _without_field(echoes: Echoes, options: ReconstructionSettings, progress: Progress) -> Surface:
+def _of_echoes(echoes: Echoes, progress: Progress, volume: Volume | None) -> Surface:
     """Return the surface that the network makes of echoes."""
-    if options.method not in ("auto", "levels"):
-        raise SettingsError(
-            f"method {options.method} needs a fitted model; give one, or take the method levels"
-        )
-    reading = read_echoes(echoes)
+    made = levels_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
     with _one_thread():
-        method, mesh = next(start_surfaces(reading, ("levels",)))
-        heard = poses_that_hear(mesh, echoes, Optics(echoes.head))
-    count = heard.cpu().numpy().astype(np.int32)
-    surface = finished_surface(mesh, method, reading, echoes=echoes, confidence=count)
+        heard = poses_that_hear(made[0], echoes, Optics(echoes.head))
+    surface = surface_as_heard(
+        made[0],
+        echoes,
+        volume=volume,
+        method="levels",
+        confidence=heard.cpu().numpy().astype(np.int32),
+        starts=dict(zip(LEVELS, made, strict=True)),
+    )
     if surface.openness is not None and surface.openness.text:
         progress.say(surface.openness.text)
     return surface
-
-
-def _resolution(model: EchoModule, echoes: Echoes | None) -> float:
-    head = model.head if echoes is None else echoes.head
-    if head is None:
-        raise SettingsError("the model knows no head; give the echoes that it was fitted to")
-    return head.resolution
 
 
 def refine(
@@ -160,9 +117,8 @@ def refine(
 ) -> Surface:
     """Move a surface until physical optics, corrected by the simulator, gives the echoes.
 
-    Of a surface that :func:`reconstruct` read out of a field, all start surfaces are tried, and the
-    one that explains the validation poses best after its refinement is taken. One of a method that
-    was asked for, one without a field and one of your own are refined as they are.
+    A surface of :func:`reconstruct` is refined in several ways, and the one that explains the
+    validation poses best is taken. One of your own is refined as it is.
 
     Args:
         surface: The start.
@@ -190,7 +146,6 @@ def refine(
     expect(echoes, Echoes, "echoes")
     accelerator = usable_accelerator(accelerator)
     simulation = checked_section(SimulationSettings, options or {}, "simulation")
-    reading = surface.reading
     starts = starts_of(surface)
     with progress.task("refining", number_of_steps(starts)) as task, _one_thread():
 
@@ -208,18 +163,19 @@ def refine(
             after_stage=after_stage,
         ).run()
     has_error = math.isfinite(refined.error_db)
-    return finished_surface(
-        refined.mesh,
-        refined.start,
-        reading,
-        echoes=echoes,
-        confidence=refined.confidence.round().astype(np.int32),
-        error=refined.error.astype(np.float32) if has_error else None,
-        refined=refined.kept,
-        error_db=refined.error_db if has_error else None,
-        faults=refined.faults,
-        candidates=refined.candidates,
-    )
+    facts: dict[str, Any] = {
+        "method": surface.method,
+        "confidence": refined.confidence.round().astype(np.int32),
+        "error": refined.error.astype(np.float32) if has_error else None,
+        "refined": refined.kept,
+        "error_db": refined.error_db if has_error else None,
+        "faults": refined.faults,
+        "volume": surface.volume,
+        "starts": surface.starts,
+    }
+    if surface.method == "given":
+        return Surface(refined.mesh, echoes=echoes, **facts)
+    return surface_as_heard(refined.mesh, echoes, **facts)
 
 
 def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
@@ -229,9 +185,7 @@ def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
             "an iso-surface is not refined; reconstruct with the method auto, or give "
             "Surface(mesh) to refine its mesh"
         )
-    if surface.reading is None:
-        return {surface.method: surface.mesh}
-    return dict(start_surfaces(surface.reading, surface.reading.methods))
+    return dict(surface.starts) or {"given": surface.mesh}
 
 
 def _placed(optics: Optics, accelerator: str) -> Optics:

@@ -35,8 +35,6 @@ from sononerf.refinement.descent import (
     are_alike,
     below,
     best_of,
-    closed_before,
-    listed,
     planned,
     poses_that_hear,
     without_twin,
@@ -49,7 +47,7 @@ from sononerf.refinement.remesh import finer, remesh
 from sononerf.refinement.surface_error import surface_error
 from sononerf.refinement.tracer import Correction, LaterBounces
 from sononerf.simulation.simulator import Simulator
-from sononerf.start.read_out import LEVELS, StartMethod
+from sononerf.start.surface import LEVELS, StartMethod
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,20 +71,12 @@ class Refined:
     # Faults of the refinement, one line each: a surface that could not be traced and counted as the
     # worst, or a stage that went without the simulator's correction
     faults: list[str]
-    # Per start: its name, its objective, that of its best surface (None where it did not get beyond
-    # the first stage), and whether it was chosen
-    candidates: list[dict[str, Any]]
 
 
 logger = logging.getLogger("sononerf")
 
 CORRECTION_POSES = 96
 """Number of training poses for which a surface is simulated; each is drawn about three times."""
-MAX_HULL_RIDGE = 1 / 16
-"""Largest height of the ridges of ``hull`` with which it is a start, shortest wavelengths; phases
-change by at most 45 degrees. A hull fits the onsets by construction, so its objective is too good
-where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
-2 mm of 0.24 with it and of 0.45 without. From 400 calls they are at most 0.04."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 Saved = MutableMapping[str, dict[str, Tensor]]
 """Stages that are done, by the names of their candidates and their numbers."""
@@ -98,7 +88,6 @@ class Refinement:
     Attributes:
         candidates: All of them; after the first stage, those that go on.
         history: As in :class:`Refined`, so far.
-        compared: Objectives of the starts that were compared.
     """
 
     def __init__(
@@ -123,7 +112,6 @@ class Refinement:
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
-        self.compared: dict[StartMethod, float] = {}
         self._far = optics.head.resolution
         self._later: tuple[Candidate, LaterBounces] | None = None
         self.candidates = self._begun()
@@ -212,7 +200,7 @@ class Refinement:
         """Return the surface that a stage begins with, and whether it is too thin for its blur."""
         stage, unit, plane = self.stages[number], self.optics.wavelength, self.optics.plane
         before = candidate.meshes[-1]
-        if candidate.schedule in ("sheet", "planes"):
+        if candidate.schedule == "planes":
             return before, False
         made = None
         if candidate.schedule == "blurred":
@@ -224,25 +212,13 @@ class Refinement:
         return (before if made is None else made), thin
 
     def _begun(self) -> list[Candidate]:
-        """Return all candidates; of the starts other than levels and sheet, the best takes part."""
-        names = [name for name in self.starts if name not in (*LEVELS, "sheet")]
-        errors = dict.fromkeys(self.starts, math.nan)
-        if len(names) > 1 and "hull" in names:
-            ridges = self.onsets.ridges(self.starts["hull"])
-            if ridges > MAX_HULL_RIDGE * self.optics.wavelength:
-                names.remove("hull")
-                del errors["hull"]
-        if len(names) > 1:
-            errors.update({name: self._compared(name) for name in names})
+        """Return all candidates."""
         network = [self.starts[name] for name in LEVELS if name in self.starts]
-        with_planes = [] if self.optics.plane else network
-        flat = flattest(with_planes, self._error, self.optics)
+        flat = flattest([] if self.optics.plane else network, self._error, self.optics)
         candidates = []
-        for start, schedule in planned(errors, flat=flat is not None):
+        for start, schedule in planned(self.starts, flat=flat is not None):
             mesh = flat if schedule == "planes" and flat is not None else self.starts[start]
-            begun = Candidate(
-                schedule, start, self._new_level(), [mesh], [errors[start]], self._far
-            )
+            begun = Candidate(schedule, start, self._new_level(), [mesh], [math.nan], self._far)
             candidates.append(begun)
         return candidates
 
@@ -253,8 +229,7 @@ class Refinement:
     def _compared(self, name: StartMethod) -> float:
         """Return the objective of a start."""
         mesh, level = self.starts[name], self._new_level()
-        self.compared[name] = self._objective(mesh, f"the start {name}", level, smooth=False)
-        return self.compared[name]
+        return self._objective(mesh, f"the start {name}", level, smooth=False)
 
     def _objective(
         self,
@@ -314,7 +289,6 @@ class Refinement:
             correction=correction,
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
-            sheet=candidate.schedule == "sheet",
             band=stage.band,
             seed=self.seed,
         )
@@ -355,7 +329,7 @@ class Refinement:
 
     def result(self) -> Refined:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
-        candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
+        candidate = best_of(self.candidates)
         best = candidate.best
         mesh = candidate.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
@@ -381,7 +355,6 @@ class Refinement:
             error_db=candidate.objective,
             history=self.history,
             faults=self.faults,
-            candidates=listed(self.starts, self.compared, self.candidates, candidate),
         )
 
 

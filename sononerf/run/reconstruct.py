@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reconstruct a run's surface: read start surfaces out of the field, and refine the best."""
+"""Reconstruct a run's surface: make it of the echoes, and refine it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ from sononerf.report.mesh_picture import confidence_png, mesh_png, side_by_side_
 from sononerf.report.mip_picture import mip_pictures
 from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.run import Run
-from sononerf.start.read_out import Method
 from sononerf.start.surface import FORMATS, Surface, mesh_bytes
 
 logger = logging.getLogger("sononerf")
@@ -115,7 +114,7 @@ def reconstruct(
     *,
     spacing: float | None = None,
     level: float | Literal["auto"] | None = None,
-    method: Method | Literal["auto"] | None = None,
+    method: Literal["levels", "isosurface"] | None = None,
     refine: bool | None = None,
     output: Path | None = None,
     accelerator: str = "auto",
@@ -123,23 +122,22 @@ def reconstruct(
 ) -> Path:
     """Write mesh, volume, projections and a view.
 
-    The surface is read out of the field and refined against the echoes that the field was fitted
-    to. If a level or a method is given, or if the settings say so, it is refined only with
-    ``refine=True``.
+    The surface is made of the echoes that the field was fitted to, and refined against them. An
+    iso-surface is read out of the field alone, and is not refined.
 
     Args:
         run: A fitted run.
         spacing (m): Voxel size; the settings' by default.
         level ("auto" or None): A number asks for an iso-surface of this level; the settings' where
             None.
-        method: Method of the read-out; that of the settings by default.
-        refine: True to refine the surface; by default as above.
+        method: Method of the surface; that of the settings by default.
+        refine: Whether to refine the surface; as the settings say by default.
         output: Folder of the results; ``RUN/reconstruction`` by default.
         accelerator: Device that refines the surface.
         progress: Display of progress.
 
     Raises:
-        NumericalError: If the field has no surface.
+        NumericalError: If there is no surface.
     """
     progress = progress or Progress(quiet=True)
     run = Run.of(run)
@@ -151,30 +149,26 @@ def reconstruct(
     if method is None:
         method = options.method if level in (None, "auto") else "isosurface"
     if level is None:
-        level = options.level if method in ("auto", "isosurface") else "auto"
-    if method == "auto" and level != "auto":
-        method = "isosurface"
+        level = options.level if method == "isosurface" else "auto"
     if level != "auto" and method != "isosurface":
         raise SettingsError(f"method {method} has no level; leave out one of the two")
     if refine and method == "isosurface":
-        raise SettingsError("an iso-surface is not refined; leave out --refine, or take a method")
-    asked = (method == "auto" and options.refine) if refine is None else refine
-    refines = asked and _has_echoes(run, progress)
+        raise SettingsError("an iso-surface is not refined; leave out --refine, or take levels")
+    if method != "isosurface" and not _has_echoes(run, progress):
+        method = "isosurface"
+    refines = (options.refine if refine is None else refine) and method != "isosurface"
     chosen = options.model_copy(
         update={"method": method, "level": level, "spacing": spacing or options.spacing}
     )
     with run.locked(None if refines else folder), results_folder(folder):
         truth = _truth(run)
-        # The start levels needs the echoes; all others need only the free space.
-        heard = run.echoes if refines or method == "levels" else run.hull
+        heard = None if method == "isosurface" else run.echoes
         surface = reconstruction.reconstruct(run.model, heard, options=chosen, progress=progress)
         if refines:
             surface = refine_surface(run, surface, accelerator=accelerator, progress=progress)
         if own:
             run.begin("surface")
         _write(folder, surface, truth, run.frame())
-        if surface.openness is not None and surface.openness.text:
-            progress.say(surface.openness.text)
         if output is None:
             run.write_metrics("cost", {"reconstruct_s": time.monotonic() - started}, merge=True)
     return folder
@@ -185,7 +179,7 @@ def _has_echoes(run: Run, progress: Progress) -> bool:
     try:
         return run.echoes is not None
     except InputError as error:
-        progress.say(f"the surface is not refined: {error}")
+        progress.say(f"an iso-surface is taken, because the surface needs the echoes: {error}")
         return False
 
 
@@ -225,7 +219,6 @@ def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None, frame:
             "validation_error_db": surface.error_db,
             **_errors(surface),
             "faults": list(surface.faults),
-            "candidates": list(surface.candidates),
         },
     )
 

@@ -18,6 +18,7 @@ import trimesh
 from sononerf import storage
 from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.evaluation.prediction import evenly, ranked
+from sononerf.field.read_out import read_isosurface
 from sononerf.head.front_end import compress, mae_db
 from sononerf.numerics import Floats, Ints
 from sononerf.progress import Progress
@@ -32,7 +33,6 @@ from sononerf.run.export import read_volume
 from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml
 from sononerf.settings.schema import Settings
-from sononerf.start.read_out import read_isosurface
 from sononerf.start.surface import confidence_of, error_of
 
 PAGE = "report.html"
@@ -246,7 +246,6 @@ def _surface(page: Page, run: Run, settings: Settings) -> None:
         run.head.resolution / 2,
     )
     page.view(views.meshes())
-    _candidates(page, run)
     page.pictures({"Four sides; colours are explained at the left.": views.png(SIDES)})
     page.heading("Maximum-intensity projections", 3)
     drawn = {}
@@ -257,23 +256,6 @@ def _surface(page: Page, run: Run, settings: Settings) -> None:
         else:
             page.say(f"{file} is missing; {command} makes it.")
     page.pictures(drawn)
-
-
-def _candidates(page: Page, run: Run) -> None:
-    """Show the starts of the refinement with their errors on validation poses."""
-    with damage_named(run.reconstruction / "read_out.json"):
-        candidates = run.read_out.get("candidates") or []
-        rows = [
-            (
-                one["start"] + (", taken" if one["chosen"] else ""),
-                *(NONE if one[k] is None else f"{one[k]:.2f}" for k in _ERRORS),
-            )
-            for one in candidates
-        ]
-    if rows:
-        page.table([("start", "its error, dB", "refined, dB"), *rows])
-        taken = _command("reconstruct", run.path, " --method open --refine")
-        page.say(f"Errors on validation poses. Another start is refined by {taken}.")
 
 
 def _truth_beside(page: Page, run: Run, settings: Settings) -> trimesh.Trimesh | None:
@@ -290,9 +272,6 @@ def _truth_beside(page: Page, run: Run, settings: Settings) -> trimesh.Trimesh |
             true = true.copy()
             true.apply_transform(np.linalg.inv(np.asarray(motion, dtype=np.float64)))
     return true
-
-
-_ERRORS = ("start_error_db", "error_db")
 
 
 @dataclass(frozen=True, eq=False)

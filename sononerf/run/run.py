@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.display import NotebookRepr
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.numbers import Evaluation
 from sononerf.evaluation.prediction import TRACED, Prediction, predict
@@ -116,11 +115,6 @@ class Run(NotebookRepr):
         return self._model.module
 
     @property
-    def hull(self) -> EchoHull:
-        """Free space in front of the onsets of the training poses."""
-        return self._model.hull
-
-    @property
     def settings(self) -> Settings:
         """Settings of the fitted experiment."""
         return self._model.settings
@@ -145,7 +139,8 @@ class Run(NotebookRepr):
             IncompatibleError: If other echoes lie there.
         """
         store = find_ensemble(self.settings, self.echo_hash, self.path)
-        return Echoes(store, self.head, self.hull)
+        box = self.model.field.region.cpu().double().numpy()
+        return Echoes(store, self.head, self._model.hull, box)
 
     def all_poses(self) -> tuple[Poses, NDArray[np.int8]]:
         """Return all poses and the use of each (P,): 0 train, 1 val, 2 test."""
@@ -211,7 +206,6 @@ class Run(NotebookRepr):
             refined=read_out["refined"],
             error_db=read_out["validation_error_db"],
             faults=tuple(read_out["faults"]),
-            candidates=tuple(read_out.get("candidates", ())),
             echoes=echoes,
         )
         if self._traced is not None:

@@ -316,21 +316,18 @@ class PredictionSettings(Section):
 
 
 class ReconstructionSettings(Section):
-    """The read-out of the finished field."""
+    """The surface of the echoes and the read-out of the finished field."""
 
     spacing: Spacing | None = None  # from the field's own resolution where it is not set
     level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"  # of an iso-surface
-    method: Literal["auto", "open", "filled", "hull", "sheet", "levels", "isosurface"] = "auto"
+    method: Literal["levels", "isosurface"] = "levels"
     refine: bool = True  # fit the surface to the echoes by physical optics
     directions: Annotated[int, Field(ge=6)] = 100
     smoothing: Annotated[float, Field(ge=0, le=1)] = 0.0  # side of a box over the volume, m
 
     @model_validator(mode="after")
     def _keys_of_an_isosurface(self) -> ReconstructionSettings:
-        others = {
-            "level": self.level != "auto" and self.method != "auto",
-            "smoothing": bool(self.smoothing),
-        }
+        others = {"level": self.level != "auto", "smoothing": bool(self.smoothing)}
         for name, stands_alone in others.items():
             if stands_alone and self.method != "isosurface":
                 raise ValueError(

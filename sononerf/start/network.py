@@ -21,15 +21,21 @@ import numpy as np
 import torch
 import trimesh
 from safetensors.torch import load_file
+from scipy import ndimage
 from torch import Tensor, nn
 
 from sononerf.echoes.detection import RangeLevels
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
-from sononerf.geometry.lattice import MARGIN, Lattice
+from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
 from sononerf.numerics import Floats, Ints, Singles
-from sononerf.start.features import FEATURES, PlaceFeatures, features_of, free_places
-from sononerf.start.occupancy import clearance_grid, surface_of, without_hollows, without_parts
+from sononerf.start.features import (
+    FEATURES,
+    PlaceFeatures,
+    clearance_grid,
+    features_of,
+    free_places,
+)
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 """File of the trained weights, float16."""
@@ -62,6 +68,7 @@ four frames raises the median F-score at 2 mm of 19 withheld bodies from 0.83 to
 from 0.59 to 0.65; eight frames give no more."""
 CHANNELS = (48, 80, 112, 144)
 """Channels of the network, from fine to coarse."""
+_RESOLVED = 8  # voxels of the smallest part
 _ROOM = 1.0  # distance in front of the onsets that the lattice covers, steps of the search
 
 
@@ -232,4 +239,30 @@ def _at_level(distance: Singles, level: float, lattice: Lattice) -> trimesh.Trim
     x, y, z = (n + 2 * MARGIN for n in lattice.shape)
     wider = Lattice(lattice.origin - MARGIN * lattice.spacing, lattice.spacing, (x, y, z))
     distance = np.pad(np.minimum(distance - level, OUTSIDE), MARGIN, constant_values=OUTSIDE)
-    return surface_of(without_parts(without_hollows(distance), wider, None), wider)
+    return surface_of(without_small_parts(without_hollows(distance)), wider)
+
+
+def without_hollows(distance: Singles) -> Singles:
+    """Fill hollows of a signed distance (X, Y, Z): no sound comes out of them."""
+    labels, _ = ndimage.label(distance > 0)
+    hollow = (labels != labels[0, 0, 0]) & (distance > 0)
+    return np.where(hollow, -distance, distance).astype(np.float32)
+
+
+def without_small_parts(distance: Singles) -> Singles:
+    """Leave out parts that the lattice does not resolve, but never all of them.
+
+    In: distance ((X, Y, Z), voxels).
+    """
+    labels, count = ndimage.label(distance < 0)
+    size = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+    dropped = np.concatenate(([False], size < min(_RESOLVED, size.max(initial=0))))[labels]
+    return np.where(dropped, np.float32(1.0), distance).astype(np.float32)
+
+
+def surface_of(distance: Singles, lattice: Lattice) -> trimesh.Trimesh:
+    """Return the surface of a signed distance (X, Y, Z), voxels, in m."""
+    # A voxel on the surface itself would be wrapped in triangles without area.
+    near = np.abs(distance) < 1e-3
+    off = np.where(near, np.where(distance < 0, -1e-3, 1e-3), distance)
+    return level_surface(off, 0.0, lattice.origin, lattice.spacing)

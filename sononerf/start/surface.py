@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -23,11 +23,21 @@ from sononerf.geometry.lattice import Volume
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats
-from sononerf.start.evidence import ALIGNED, poses_that_heard
-from sononerf.start.occupancy import MIN_EVIDENCE
-from sononerf.start.read_out import MAX_SHEET_THICKNESS, Method, Reading
 
 MeshFormat = Literal["ply", "stl", "glb"]
+StartMethod = Literal["levels", "fuller", "given"]
+"""Start of a refinement. ``levels``: the surface of the network (:mod:`sononerf.start.network`).
+``fuller``: that of the network with gaps closed. ``given``: a surface of the user's."""
+LEVELS: tuple[StartMethod, ...] = ("levels", "fuller")
+"""Start surfaces that the network makes at once."""
+Method = Literal["levels", "given", "isosurface"]
+"""Method of a surface: the start that was refined, or a level of the field's volume."""
+MAX_SHEET_THICKNESS = 0.7
+"""Distance of the other side below which a place is thin, range resolutions. The sides of a sheet
+share one echo, so neither is known to better than a fraction of the resolution."""
+ALIGNED = 0.3
+"""Distance that a place may lie outside of the convex hull of heard ones and still be on one smooth
+surface with them, range resolutions."""
 
 
 def mesh_bytes(
@@ -158,7 +168,7 @@ class Surface(NotebookRepr):
     Attributes:
         mesh: World frame, m.
         volume: The field's energy, or its loudness for an iso-surface; None without a field.
-        method: Method of the surface, or the start that was refined.
+        method: Method of the surface.
         level: Level of an iso-surface, in the unit of the volume; None for other methods.
         openness: Kind of surface; None for an iso-surface and for one of your own.
         confidence ((V,) int32 or None): Number of poses that heard the surface around each vertex.
@@ -167,10 +177,8 @@ class Surface(NotebookRepr):
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
-        candidates: The starts of the refinement with their objectives, see
-            :class:`~sononerf.refinement.refine.Refined`.
         echoes: Echoes of its field; None if unknown.
-        reading: Evidence that it was made from; None if there is none.
+        starts: Closed surfaces that a refinement begins with, m; the mesh itself where empty.
 
     Raises:
         InputError: If the mesh has no triangles, or a vertex is not finite.
@@ -186,9 +194,8 @@ class Surface(NotebookRepr):
     refined: bool = False
     error_db: float | None = None
     faults: Sequence[str] = ()
-    candidates: Sequence[dict[str, Any]] = ()
     echoes: Echoes | None = field(default=None, repr=False)
-    reading: Reading | None = field(default=None, repr=False)
+    starts: Mapping[StartMethod, trimesh.Trimesh] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         expect(self.mesh, trimesh.Trimesh, "mesh")
@@ -216,50 +223,29 @@ class Surface(NotebookRepr):
         return mesh_bytes(self.mesh, kind, confidence=self.confidence, error=self.error)
 
 
-def finished_surface(
-    mesh: trimesh.Trimesh,
-    method: Method,
-    reading: Reading | None,
-    *,
-    echoes: Echoes | None = None,
-    confidence: NDArray[np.int32] | None = None,
-    error: NDArray[np.float32] | None = None,
-    refined: bool = False,
-    error_db: float | None = None,
-    faults: Sequence[str] = (),
-    candidates: Sequence[dict[str, Any]] = (),
+def surface_as_heard(
+    mesh: trimesh.Trimesh, echoes: Echoes, *, confidence: NDArray[np.int32], **facts: Any
 ) -> Surface:
     """Return the surface of a closed mesh, without the triangles that no pose can have heard.
 
-    An open surface also ends where the evidence for it ends.
+    An open surface also ends where what was heard ends. ``facts`` are further attributes of it.
 
-    In: confidence ((V,) int32), error ((V,) float32, m).
+    In: confidence (V,).
     """
-    keywords: dict[str, Any] = {"echoes": echoes, "reading": reading}
-    keywords |= {"refined": refined, "error_db": error_db, "faults": faults}
-    keywords["candidates"] = candidates
-    if reading is None:
-        return Surface(mesh, None, method, confidence=confidence, error=error, **keywords)
-    gathered, hull, resolution = reading.gathered, reading.hull, reading.resolution
-    if confidence is None:
-        assert gathered is not None  # without a field the caller counts
-        confidence = poses_that_heard(mesh, gathered.evidence, resolution)
+    hull, resolution = echoes.hull, echoes.head.resolution
+    error = facts.pop("error", None)
     openness = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)
     if openness.kind == "one-sided":
-        heard = confidence
-        if gathered is not None:
-            reliable = gathered.evidence.where(gathered.weight > MIN_EVIDENCE)
-            heard = poses_that_heard(mesh, reliable, resolution)
-        part = known_part(mesh, heard, hull, resolution=resolution)
-        voxel = resolution / 2 if gathered is None else gathered.lattice.spacing
-        part &= ~at_wall(mesh.triangles_center, reading.box, voxel)
+        part = known_part(mesh, confidence, hull, resolution=resolution)
+        part &= ~at_wall(mesh.triangles_center, echoes.bounds, resolution / 2)
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
         mesh, confidence = without_unseen(mesh, openness), confidence[used]
         error = None if error is None else error[used]
-    keywords |= {"openness": openness, "confidence": confidence, "error": error}
-    return Surface(mesh, reading.volume, method, **keywords)
+    return Surface(
+        mesh, openness=openness, confidence=confidence, error=error, echoes=echoes, **facts
+    )
 
 
 MIN_FACING = 0.1

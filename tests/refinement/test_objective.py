@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -137,19 +135,6 @@ def test_onsets_may_all_come_late_but_not_early(box):
     assert onsets.misfit(vertices_of(larger), late=0.1 * off) > 0.8 * before
     early = onsets.misfit(vertices_of(smaller))
     assert onsets.misfit(vertices_of(smaller), late=2 * off) == early
-
-
-def test_ridges_of_a_hull_are_those_of_tangent_planes():
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)
-    few, many = (OnsetRanges(heard(ball, count=count), RESOLUTION, seed=0) for count in (50, 200))
-    # A plane belongs to 4 pi / 50 of the sphere; half of that lies within an angle of 0.2 of it.
-    assert few.ridges(ball) == pytest.approx(0.02 * (1 / np.cos(0.2) - 1), rel=0.3)
-    assert few.ridges(ball) == pytest.approx(4 * many.ridges(ball), rel=0.3)
-    around = heard(ball, count=800)
-    low = np.abs(around.emitters[:, 2:]) < 0.05
-    ring = OnsetRanges(replace(around, weight=low * np.ones((1, 2))), RESOLUTION, seed=0)
-    # Most of the ball lies above and below the ring, where no pose bounds it.
-    assert ring.ridges(ball) < few.ridges(ball)
 
 
 def test_going_against_the_gradient_lowers_the_misfit(box):

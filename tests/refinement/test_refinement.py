@@ -9,13 +9,11 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import InputError
-from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.head import Head
 from sononerf.refinement import objective as objectives_module
 from sononerf.refinement import refine as module
-from sononerf.refinement.descent import Candidate, Descent, Stage, best_of, planned, poses_that_hear
+from sononerf.refinement.descent import Candidate, Descent, Stage, planned, poses_that_hear
 from sononerf.refinement.objective import ErrorLevel, OnsetRanges
 from sononerf.refinement.optics import Optics
 from sononerf.refinement.refine import Refinement
@@ -35,7 +33,7 @@ def unasked(mesh):
 
 def refined(meshes, echoes, optics, *, simulate=unasked, stages=None, **given):
     return Refinement(
-        meshes if isinstance(meshes, dict) else {"body": meshes},
+        meshes if isinstance(meshes, dict) else {"given": meshes},
         echoes,
         optics,
         simulate=simulate,
@@ -62,7 +60,7 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
     tilted = changed(
         echoes, read=lambda n: echoes.store.read_pose(n) * tilt, hull=deaf_hull(), origin="recorded"
     )
-    work = begun({"body": bumpy}, tilted, optics)
+    work = begun({"given": bumpy}, tilted, optics)
     work.first_stage()
     assert work.candidates[0].drawn == SHORT[0].steps  # the next stage begins with other poses
     gain = work.candidates[0].level.gain[0].exp().numpy()
@@ -99,30 +97,6 @@ def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
     assert off(found.mesh) < 0.5 * off(bumpy)
 
 
-def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
-    half = bumpy.copy().apply_scale(0.5)
-    for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
-        work = begun(starts, echoes, optics)
-        assert [(one.start, one.schedule) for one in work.candidates] == [
-            ("whole", "blurred"),
-            ("whole", "sharp"),
-        ]
-        (mesh,) = work.candidates[0].meshes
-        np.testing.assert_array_equal(mesh.vertices, bumpy.vertices)
-
-
-@pytest.mark.parametrize(("count", "chosen"), [(20, "filled"), (1000, "hull")])
-def test_a_hull_takes_part_only_if_poses_are_dense(bumpy, echoes, optics, count, chosen):
-    places = 0.4 * fibonacci_sphere(count)
-    ears = np.repeat(places[:, None], 2, axis=1)
-    far = np.linalg.norm(places[:, None] - bumpy.vertices, axis=2).min(axis=1)
-    heard = EchoHull(places, ears, np.stack([far, far], axis=1), -places / 0.4)
-    echoes = changed(echoes, hull=heard)
-    starts = {"hull": bumpy, "filled": bumpy.copy().apply_scale(0.5)}
-    for given, found in ((starts, chosen), ({"hull": bumpy}, "hull")):
-        assert begun(given, echoes, optics).candidates[0].start == found
-
-
 @pytest.fixture
 def simulated_stage(settings):
     """Two short stages, the second one corrected by the simulator."""
@@ -151,17 +125,6 @@ def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same_and_told(
     assert fault in caplog.text
 
 
-def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
-    bumpy, echoes, optics, caplog
-):
-    flat = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
-    found = refined({"open": flat, "filled": bumpy}, echoes, optics)
-    assert found.start == "filled"
-    (fault,) = found.faults
-    assert fault.startswith("the start open cannot be compared and counts as the worst: ")
-    assert fault in caplog.text
-
-
 @pytest.mark.parametrize("corrected", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_saved_stages_are_not_repeated_and_the_end_is_the_same(
     bumpy, echoes, optics, simulated_stage, corrected
@@ -170,9 +133,9 @@ def test_saved_stages_are_not_repeated_and_the_end_is_the_same(
     saved, ends = {}, {}
     whole = refined(bumpy, echoes, optics, saved=saved, **given)
     assert list(saved) == [
-        "body-blurred-0",
-        "body-sharp-0",
-        f"body-{whole.history[-1]['schedule']}-1",
+        "given-blurred-0",
+        "given-sharp-0",
+        f"given-{whole.history[-1]['schedule']}-1",
     ]
     for kept in range(4):  # a kill after each stage
         some = dict(list(saved.items())[:kept])
@@ -262,37 +225,11 @@ def preset(work, objective):
     return work
 
 
-@pytest.mark.parametrize(
-    ("error", "closed", "chosen"),
-    [
-        (5.2, {"levels", "open"}, "levels"),
-        (5.9, {"levels", "open"}, "open"),
-        (4.5, {"open"}, "open"),  # what no pose can have heard is no body
-        (5.2, {"open"}, "open"),
-        (5.2, set(), "levels"),
-        (2.9, {"open"}, "levels"),  # its error is low
-    ],
-)
-def test_in_doubt_a_closed_candidate_is_chosen_and_levels_before_others(
-    bumpy, error, closed, chosen
-):
-    meshes = {name: bumpy.copy() for name in ("levels", "open")}
-    candidates = [
-        Candidate("sharp", name, None, [bumpy, mesh], [9.0, 5.0 if name == "open" else error])
-        for name, mesh in meshes.items()
-    ]
-    inside = [meshes[name] for name in closed]
-    found = best_of(candidates, lambda mesh: any(mesh is one for one in inside))
-    assert found.start == chosen
-
-
 def test_levels_is_refined_from_the_fuller_surface_too():
-    assert planned({"levels": math.nan, "fuller": math.nan, "open": 5.0, "filled": 4.0}) == [
+    assert planned(["levels", "fuller"]) == [
         ("levels", "sharp"),
         ("fuller", "blurred"),
         ("fuller", "sharp"),
-        ("filled", "blurred"),
-        ("filled", "sharp"),
     ]
 
 
@@ -341,7 +278,7 @@ def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_
     work.first_stage()
     assert (first.schedule, first.start) == ("planes", "levels")
     np.testing.assert_array_equal(first.meshes[0].vertices, levels.vertices)
-    assert first.objectives[0] == work.compared["levels"]
+    assert math.isfinite(first.objectives[0])
 
 
 def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
@@ -352,19 +289,13 @@ def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
 @pytest.mark.slow
 def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
     ends = []
-    for starts in ({"body": bumpy}, {"levels": bumpy.copy().apply_scale(1.05), "body": bumpy}):
+    for starts in ({"given": bumpy}, {"levels": bumpy.copy().apply_scale(1.05), "given": bumpy}):
         saved = {}
         begun(starts, echoes, optics, saved=saved).first_stage()
         ends.append(saved)
     for way in ("blurred", "sharp"):
-        one, other = (saved[f"body-{way}-0"]["vertices"].numpy() for saved in ends)
+        one, other = (saved[f"given-{way}-0"]["vertices"].numpy() for saved in ends)
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.slow
-def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
-    starts = {"body": bumpy, "levels": bumpy.copy()}
-    assert len(refined(starts, echoes, optics).history) == 5
 
 
 @pytest.mark.parametrize(
@@ -380,7 +311,7 @@ def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
     ],
 )
 def test_the_later_of_equal_surfaces_is_kept(bumpy, objectives, best):
-    candidate = Candidate("sharp", "body", None, [bumpy] * len(objectives), list(objectives))
+    candidate = Candidate("sharp", "given", None, [bumpy] * len(objectives), list(objectives))
     assert candidate.best == best
 
 
@@ -408,39 +339,8 @@ def test_a_torn_surface_loses_unless_its_error_is_low(bumpy, error, kept):
     moved = bumpy.copy()
     moved.apply_scale(2.0)
     for mesh in (in_two, moved):
-        candidate = Candidate("sharp", "open", None, [bumpy, mesh], [9.0, error], 0.006)
+        candidate = Candidate("sharp", "given", None, [bumpy, mesh], [9.0, error], 0.006)
         assert (candidate.best > 0) == kept
-
-
-def slab(height):
-    """A thin plate, thinner than any voxel of the stages."""
-    plate = trimesh.creation.box((0.02, 0.02, height))
-    return plate.subdivide().subdivide().subdivide().subdivide()
-
-
-def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
-    bumpy, echoes, optics, monkeypatch
-):
-    thin = slab(2e-4)
-    for value, start in ((1.1, "sheet"), (2.0, "body")):
-        starts = {"body": bumpy, "sheet": thin}
-        saved = {}
-        for _ in range(2):  # the second time the stages are saved
-            work = preset(
-                begun(starts, echoes, optics, saved=saved),
-                lambda mesh, one, number, v=value: v if one and one.schedule == "sheet" else 1.0,
-            )
-            work.first_stage()
-            (candidate,) = work.candidates
-            assert candidate.start == start
-            if start == "sheet":
-                assert all(len(mesh.faces) == len(thin.faces) for mesh in candidate.meshes)
-
-
-def test_a_sheet_alone_is_refined(echoes, optics):
-    found = refined({"sheet": slab(2e-4)}, echoes, optics)
-    assert found.start == "sheet"
-    assert {one["schedule"] for one in found.history} == {"sheet"}
 
 
 @pytest.fixture(scope="module")

@@ -143,7 +143,7 @@ def test_renderer_and_refinement_have_the_range_resolution_of_the_head(config):
         within=0.5,
     )
     work = Refinement(
-        {"filled": trimesh.creation.icosphere()},
+        {"given": trimesh.creation.icosphere()},
         echoes_of(head, np.zeros((1, 3)), np.eye(3)[None], None, [0], hull),
         Optics(head),
         simulate=lambda mesh: None,

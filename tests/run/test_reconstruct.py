@@ -47,7 +47,7 @@ def test_every_file_is_there_and_readable(run):
 @pytest.mark.slow
 def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     coarse = reconstruct(run, spacing=0.012, output=tmp_path / "coarse")
-    assert read_out(coarse)["method"] in ("open", "filled", "hull")
+    assert read_out(coarse)["method"] == "levels"
     assert read_out(coarse)["level"] is None
     fine = reconstruct(run, spacing=0.007, method="isosurface", output=tmp_path / "fine")
     assert read_out(coarse)["spacing_m"] == pytest.approx(0.012)
@@ -63,16 +63,16 @@ def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     assert not (run / "metrics.json").exists()
 
 
+ISO = {"method": "isosurface", "level": "known"}
+
+
 @pytest.mark.parametrize(
     ("settings", "given", "expected"),
     [
-        ({}, {}, "filled"),
-        pytest.param({"method": "open"}, {}, "open", marks=pytest.mark.slow),
-        ({"method": "open"}, {"method": "hull"}, "hull"),
-        ({"method": "open"}, {"level": "found"}, "isosurface"),
-        ({"level": "found"}, {}, "isosurface"),
-        pytest.param({"level": "found"}, {"method": "hull"}, "hull", marks=pytest.mark.slow),
-        pytest.param({"level": "found"}, {"level": "auto"}, "filled", marks=pytest.mark.slow),
+        ({}, {}, "levels"),
+        ({}, {"level": "known"}, "isosurface"),
+        (ISO, {}, "isosurface"),
+        (ISO, {"method": "levels"}, "levels"),
     ],
 )
 def test_what_the_caller_gives_replaces_the_settings(
@@ -81,7 +81,7 @@ def test_what_the_caller_gives_replaces_the_settings(
     plain = reconstruct(run, spacing=0.012, method="isosurface", output=tmp_path / "plain")
     level = read_out(plain)["level"]
     settings, given = (
-        {key: level if value == "found" else value for key, value in part.items()}
+        {key: level if value == "known" else value for key, value in part.items()}
         for part in (settings, given)
     )
     description = json.loads((run / "model.json").read_text())
@@ -106,8 +106,8 @@ def test_a_true_surface_that_is_gone_costs_nothing_but_its_view(
 
 
 def test_only_an_isosurface_has_a_level(run):
-    with pytest.raises(SettingsError, match="method hull has no level"):
-        reconstruct(run, method="hull", level=0.5)
+    with pytest.raises(SettingsError, match="method levels has no level"):
+        reconstruct(run, method="levels", level=0.5)
 
 
 def test_a_level_above_everything_has_no_surface(run):

@@ -78,20 +78,22 @@ def test_a_run_has_its_refined_surface(run, no_projections):
     events.Reload()
     # Event files of one second are read by their names, in which file 10 comes before file 9.
     stages_shown = sorted(one.step for one in events.Scalars("refinement/validation_error_dB"))
-    # Both ways of levels and of another start, and further stages of those that were kept.
+    # The first stage of each way, and further ones of the best.
     assert stages_shown == list(range(1, len(stages_shown) + 1))
-    assert 5 <= len(stages_shown) <= 8
+    assert 4 <= len(stages_shown) <= 8
     assert "mesh/refinement_stages_VERTEX" in events.Tags()["tensors"]
-    again = reconstruct(run, method="filled", spacing=0.008, accelerator="cpu")
+    again = reconstruct(run, refine=False, spacing=0.008, accelerator="cpu")
     found = read_json(again / "read_out.json")
     assert found["validation_error_db"] is found["median_error_m"] is None
 
 
-def test_without_its_echoes_a_surface_is_not_refined(run, no_projections):
+def test_without_its_echoes_a_run_has_an_isosurface(run, no_projections):
     with_settings(run, "reconstruction", refine=True)
     with_settings(run, "data", store=str(run.parent / "gone"))
     heard = Heard()
     folder = reconstruct(run, accelerator="cpu", spacing=0.008, progress=heard)
-    assert heard.said[0].startswith("the surface is not refined: ")
+    assert heard.said[0].startswith(
+        "an iso-surface is taken, because the surface needs the echoes: "
+    )
     assert "is not there" in heard.said[0]
-    assert read_json(folder / "read_out.json")["method"] == "filled"
+    assert read_json(folder / "read_out.json")["method"] == "isosurface"

@@ -32,7 +32,7 @@ def given_a_surface(run):
     place.mkdir(exist_ok=True)
     data = mesh_bytes(mesh, "ply", confidence=np.arange(len(mesh.vertices)))
     (place / "mesh.ply").write_bytes(data)
-    (place / "read_out.json").write_text('{"method": "filled", "refined": false}')
+    (place / "read_out.json").write_text('{"method": "levels", "refined": false}')
     axis = np.linspace(-0.03, 0.03, 21)
     off = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis)), axis=0)
     volume = Volume(np.exp(-0.5 * ((off - 0.02) / 0.004) ** 2), np.full(3, -0.03), 0.003)
@@ -100,7 +100,7 @@ def test_a_run_that_grows_is_followed(run, shown):
     description.rename(run / "model.json")
     given_a_surface(run)
     view.refresh()
-    assert "surface found as filled" in view.viewer._status.content
+    assert "surface found as levels" in view.viewer._status.content
     assert {"surface", "truth", "volume", "poses"} <= view.viewer._boxes.keys()
 
 

@@ -339,20 +339,16 @@ def test_poses_of_an_arrangement_say_what_it_needs_and_nothing_else(write, poses
     assert f": poses: {said}" in line
 
 
-@pytest.mark.parametrize("method", ["open", "filled", "hull"])
-def test_only_an_isosurface_has_a_level(write, method):
-    (line,) = faults(write(SCENE + f"reconstruction: {{level: 0.4, method: {method}}}\n"))
-    assert f": reconstruction: level is of the method isosurface, not of {method}" in line
-    for other in ("auto", "isosurface"):
-        settings = load_settings(
-            write(SCENE + f"reconstruction: {{level: 0.4, method: {other}}}\n")
-        )
-        assert settings.reconstruction.level == 0.4
+def test_only_an_isosurface_has_a_level(write):
+    (line,) = faults(write(SCENE + "reconstruction: {level: 0.4}\n"))
+    assert ": reconstruction: level is of the method isosurface, not of levels" in line
+    settings = load_settings(write(SCENE + "reconstruction: {level: 0.4, method: isosurface}\n"))
+    assert settings.reconstruction.level == 0.4
 
 
 def test_only_an_isosurface_is_smoothed(write):
     (line,) = faults(write(SCENE + "reconstruction: {smoothing: 0.045}\n"))
-    assert ": reconstruction: smoothing is of the method isosurface, not of auto" in line
+    assert ": reconstruction: smoothing is of the method isosurface, not of levels" in line
     settings = load_settings(
         write(SCENE + "reconstruction: {smoothing: 0.045, method: isosurface}\n")
     )

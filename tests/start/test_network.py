@@ -37,6 +37,8 @@ from sononerf.start.network import (
     lattice_of,
     levels_surfaces,
     lots_of,
+    without_hollows,
+    without_small_parts,
 )
 
 RESOLUTION = 0.006
@@ -306,3 +308,17 @@ def test_the_weights_fit_the_network():
     state = load_file(network.WEIGHTS)
     assert state.keys() == StartNetwork().state_dict().keys()
     assert all(bool(part.isfinite().all()) for part in state.values())
+
+
+def test_hollows_are_filled_and_parts_of_few_voxels_left_out():
+    distance = np.ones((20, 20, 20), np.float32)
+    distance[2:10, 2:10, 2:10] = -1.0
+    distance[5, 5, 5] = 1.0
+    distance[15, 15, 15:18] = -1.0
+    cleaned = without_small_parts(without_hollows(distance))
+    assert (cleaned[2:10, 2:10, 2:10] < 0).all()
+    assert (cleaned < 0).sum() == 8**3
+    assert (without_small_parts(np.where(distance < 0, 1, distance)) > 0).all()
+    alone = np.ones_like(distance)
+    alone[15, 15, 15:18] = -1.0
+    np.testing.assert_array_equal(without_small_parts(alone), alone)

@@ -13,9 +13,9 @@ from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.meshes import Plane
 from sononerf.start import surface
-from sononerf.start.read_out import MAX_SHEET_THICKNESS
 from sononerf.start.surface import (
     MANY_POSES,
+    MAX_SHEET_THICKNESS,
     MIN_FACING,
     Openness,
     confidence_colours,

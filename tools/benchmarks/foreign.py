@@ -39,7 +39,7 @@ from tools.benchmarks.experiment import (
 
 KINDS = (".ply", ".stl", ".obj", ".off")
 """Endings of the files that are taken."""
-STARTS = ("levels", "fuller", "open", "filled", "hull", "sheet")
+STARTS = ("levels", "fuller")
 """Order of the starts in the table."""
 
 
@@ -94,7 +94,6 @@ def measured(body: Path, settings: Sequence[str], output: Path) -> Row:
         "result": scores(found.mesh, truth),
         "chosen": found.method,
         "kept": found.refined,
-        "candidates": list(found.candidates),
         "fit_s": fitted - begun,
         "surface_s": ended - fitted,
     }

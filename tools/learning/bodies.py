@@ -19,9 +19,9 @@ from trimesh.transformations import random_rotation_matrix, rotation_matrix
 
 Random = np.random.Generator
 Kind = Callable[[Random], trimesh.Trimesh]
-SMALLEST, LARGEST = 0.06, 0.15
-"""Longest side of a body, m."""
-LEAST = 3e-6
+SMALLEST, LARGEST = 0.05, 0.3
+"""Longest side of a body, m; half of the bodies are below 0.12 m."""
+LEAST = 3e-7
 """Volume of the smallest body, m³."""
 EDGE = 0.006
 """Longest edge of a body's triangles, m."""
@@ -44,10 +44,14 @@ def body(seed: int) -> tuple[str, trimesh.Trimesh]:
         _turned(mesh, random)
         mesh.merge_vertices()
         mesh.apply_translation(-mesh.bounds.mean(axis=0))
-        mesh.apply_scale(random.uniform(SMALLEST, LARGEST) / mesh.extents.max())
+        mesh.apply_scale(_size(random) / mesh.extents.max())
         if mesh.is_watertight and mesh.volume > LEAST:
             return kind.__name__, mesh.subdivide_to_size(EDGE)
     raise ValueError(f"seed {seed}: {_TRIES} drawings gave no closed body")
+
+
+def _size(random: Random) -> float:
+    return float(np.exp(random.uniform(*np.log([SMALLEST, LARGEST]))))
 
 
 def _turned(mesh: trimesh.Trimesh, random: Random) -> trimesh.Trimesh:
@@ -312,7 +316,64 @@ def _may_touch(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
     return bool(between <= reach)
 
 
+def sheet(random: Random) -> trimesh.Trimesh:
+    """Return a thin plate, bent, curled and twisted."""
+    outline = _outline(random)
+    thick = float(np.exp(random.uniform(*np.log([0.006, 0.04]))))
+    flat = manifold3d.Manifold.extrude(outline, thick).refine_to_length(0.05).to_mesh()
+    x, y, z = np.array(flat.vert_properties)[:, :3].T
+    turn = random.uniform(0.0, 2 * np.pi)
+    x, y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+    x *= random.uniform(0.6, 1.6)
+    bend, lift = random.choice([0.0, 1.0], p=[0.2, 0.8]) * random.uniform(0.1, 1.2), z - thick / 2
+    angle = bend * y
+    across = np.where(bend > 0, (1 / max(bend, 1e-9) - lift) * np.sin(angle), y)
+    up = np.where(bend > 0, (1 - np.cos(angle)) / max(bend, 1e-9) + lift * np.cos(angle), lift)
+    up = up + random.normal(0.0, 0.15) * x**2 + random.normal(0.0, 0.1) * x * across
+    return trimesh.Trimesh(np.column_stack((x, across, up)), np.array(flat.tri_verts))
+
+
+def gear(random: Random) -> trimesh.Trimesh:
+    """Return a toothed wheel with a bore."""
+    count, deep = random.integers(6, 24), random.uniform(0.1, 0.3)
+    angle = np.linspace(0.0, 2 * np.pi, 8 * count + 1)[:-1]
+    tooth = np.clip(1.5 * np.sin(count * angle), -1.0, 1.0)
+    outline = _around(angle, 1.0 + deep * tooth)
+    if random.random() < 0.7:
+        outline -= manifold3d.CrossSection.circle(random.uniform(0.15, 0.6), 64)
+    made = manifold3d.Manifold.extrude(outline, random.uniform(0.15, 0.8)).to_mesh()
+    return trimesh.Trimesh(np.array(made.vert_properties)[:, :3], np.array(made.tri_verts))
+
+
+def frame(random: Random) -> trimesh.Trimesh:
+    """Return bars between the points of a grid, as of a lattice or a shelf."""
+    x, y, z = (int(n) for n in random.integers(2, 4, 3))
+    wide, step = random.uniform(0.05, 0.16), random.uniform(0.7, 1.3, 3)
+    parts = []
+    for place in np.ndindex(x, y, z):
+        for axis in range(3):
+            if place[axis] + 1 < (x, y, z)[axis] and random.random() < 0.85:
+                size = np.full(3, wide)
+                size[axis] += step[axis]
+                bar = creation.box(size)
+                parts.append(bar.apply_translation((np.array(place) + np.eye(3)[axis] / 2) * step))
+    whole = _union(parts)
+    return max(whole.split(), key=lambda one: one.volume)
+
+
+def shell(random: Random) -> trimesh.Trimesh:
+    """Return a thin shell of a smooth body, open at one side."""
+    outer = blob(random)
+    wall = float(np.exp(random.uniform(*np.log([0.02, 0.12]))))
+    inner = outer.copy()
+    inner.vertices = inner.vertices - wall * inner.vertex_normals
+    cut = creation.box([4.0, 4.0, 4.0])
+    cut.apply_translation([0.0, 0.0, 2.0 + random.uniform(-0.3, 0.5) * outer.extents[2] / 2])
+    return _without(_without(outer, inner), _turned(cut, random))
+
+
 KINDS: tuple[Kind, ...] = (
     solids, lathe, extrusion, tubes, table, blob, cluster, slabs, lathe, tubes,
+    sheet, sheet, shell, gear, frame,
 )  # fmt: skip
 """Kinds in the order of the seeds."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.ndimage import map_coordinates
+from scipy import ndimage
 
 import sononerf
 from sononerf import storage
@@ -26,7 +26,7 @@ from sononerf.geometry.lattice import Lattice
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
 from sononerf.start.features import PlaceFeatures, features_of, free_places
-from sononerf.start.network import lattice_of
+from sononerf.start.network import PAIRS, lattice_of
 from tools.learning.bodies import body
 
 Axes = tuple[int, ...]
@@ -36,8 +36,14 @@ POSES, VALIDATING = 160, 2
 """Number of simulated poses, and how many of them are for validation."""
 DB, STEPS = 0.5, 20
 """Step of a stored level, dB, and number of steps of a stored distance per voxel."""
-LARGEST = 3_000_000
+LARGEST = 4_000_000
 """Number of voxels above which a body is left out, because its region was found too large."""
+LEAST_DEPTH = 0.7
+"""Depth of the true signed distance in the thinnest bodies, voxels: a sheet that is thinner than a
+voxel would have no place inside."""
+LOWER_BAND = {"frequency_min": 20e3, "frequency_max": 50e3}
+"""Band of every third head, Hz; the others have the default one. Lengths are in range resolutions,
+so that other bands are bodies of other sizes."""
 FEWEST, LEAST = 25, 12
 """Number of poses, at least, where some are drawn at random, and where those of one side are."""
 
@@ -103,16 +109,24 @@ def make_example(number: int, folder: Path, meshes: Path | None = None) -> str:
 
 
 def heard(mesh: trimesh.Trimesh, seed: int) -> sononerf.Echoes:
-    """Return the echoes of a body from poses all around it, by few rays."""
-    random = np.random.default_rng([47, seed])
+    """Return the echoes of a body from poses all around it, by few rays, heard by a head."""
+    random = np.random.default_rng([75, seed])
+    radius = max(0.4, 2.2 * float(mesh.extents.max()))
     poses = sononerf.Poses.sphere(
-        POSES, radius=0.4, aim_jitter=0.26, generator=np.random.default_rng(seed)
+        POSES, radius=radius, aim_jitter=0.26, generator=np.random.default_rng(seed)
     )
+    ears = {}
+    if random.random() < 0.4:
+        count = int(random.integers(1, 5))
+        ears = {"receivers": random.uniform(-0.03, 0.03, (count, 3)).round(4).tolist()}
+    spectrogram = {"range_max": radius + 0.2}
+    if random.random() < 0.3:
+        spectrogram |= LOWER_BAND
     rays = int(random.integers(4000, 9000))
     return sononerf.simulate(
         sononerf.Scene(mesh),
         poses,
-        sononerf.Head(),
+        sononerf.Head(ears=ears, spectrogram=spectrogram),
         split=np.where(np.arange(POSES) < VALIDATING, "val", "train"),
         options={"engine": "rays", "rays": rays, "seed": seed, "noise_floor_poses": 0},
         workers=1,
@@ -121,13 +135,21 @@ def heard(mesh: trimesh.Trimesh, seed: int) -> sononerf.Echoes:
 
 
 def true_distance(mesh: trimesh.Trimesh, lattice: Lattice) -> Singles:
-    """Return the signed distance to a closed mesh, (X, Y, Z) voxels, positive outside."""
+    """Return the signed distance to a closed mesh, (X, Y, Z) voxels, positive outside.
+
+    A body that is thinner than the voxels show is made ``LEAST_DEPTH`` deep.
+    """
     solid, places = Solid(mesh), lattice.points()
     near = solid.nearest.near(places, FAR * lattice.spacing)
     distance = np.full(len(places), FAR)
     distance[near] = np.minimum(solid.nearest.distance(places[near]) / lattice.spacing, FAR)
-    signed = np.where(solid.contains(places), -distance, distance)
-    return signed.reshape(lattice.shape).astype(np.float32)
+    signed = np.where(solid.contains(places), -distance, distance).reshape(lattice.shape)
+    deepest = ndimage.minimum_filter(signed, 5)
+    nearest = ndimage.distance_transform_edt(
+        np.abs(signed) > 0.9, return_distances=False, return_indices=True
+    )
+    missing = (deepest + LEAST_DEPTH).clip(0.0, LEAST_DEPTH)[tuple(nearest)]
+    return (signed - missing).astype(np.float32)
 
 
 def load_example(file: Path) -> Example:
@@ -193,22 +215,32 @@ def draw(example: Example, random: np.random.Generator, side: int) -> Crop:
     room = np.maximum(size - 2 * side * lattice.spacing, 0) / 2 + 8 * lattice.spacing
     centre = lattice.origin + size / 2 + 0.7 * room * random.uniform(-1, 1, 3)
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]  # some of them mirror
+    ears = _ears(example, random)
     some = _poses(example, random)
+    if len(some) * len(ears) > PAIRS:
+        some = np.sort(random.choice(some, PAIRS // len(ears), replace=False))
     levels = dataclasses.replace(
         example.levels,
         emitters=(example.levels.emitters - centre) @ turn.T,
-        receivers=(example.levels.receivers - centre) @ turn.T,
-        level=_noisy(example.levels.level, random),
+        receivers=(example.levels.receivers[:, ears] - centre) @ turn.T,
+        level=_noisy(example.levels.level[:, ears], random),
     )
     axes = np.zeros((len(example.onsets), 3))
-    hull = EchoHull(levels.emitters, levels.receivers, example.onsets, axes)
+    hull = EchoHull(levels.emitters, levels.receivers, example.onsets[:, ears], axes)
     crop = Lattice(
         np.full(3, -(2 * side - 1) / 2 * lattice.spacing), lattice.spacing, (2 * side,) * 3
     )
     places = features_of(levels, some, hull, crop, free_places(hull, crop))
     at = lattice.coordinates(crop.points() @ turn + centre).T
-    true = map_coordinates(example.true, at, order=1, mode="constant", cval=FAR)
+    true = ndimage.map_coordinates(example.true, at, order=1, mode="constant", cval=FAR)
     return Crop(places, true.reshape(crop.shape))
+
+
+def _ears(example: Example, random: np.random.Generator) -> Ints:
+    """Return all ears, or some of them."""
+    count = example.onsets.shape[1]
+    some = count if random.random() < 0.7 else int(random.integers(1, count + 1))
+    return np.sort(random.choice(count, some, replace=False))
 
 
 def _poses(example: Example, random: np.random.Generator) -> Ints:

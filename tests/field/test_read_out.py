@@ -3,12 +3,11 @@ import numpy as np
 import pytest
 import torch
 
-from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
-from sononerf.field.field import Field, sphere_directions
+from sononerf.field.field import Field
 from sononerf.field.fields import GridField
-from sononerf.start.read_out import energy_volume, read_field, read_isosurface, start_surfaces
-from sononerf.start.surface import Surface, finished_surface
+from sononerf.field.read_out import energy_volume, read_isosurface
+from sononerf.start.surface import Surface
 
 FREQUENCY = torch.tensor([30e3, 50e3, 70e3])
 RADIUS, SPACING = 0.015, 0.003
@@ -51,101 +50,15 @@ def radii(mesh):
     return np.linalg.norm(mesh.triangles_center - MIDDLE.numpy(), axis=1)
 
 
-class Sounding(GridField):
-    """Wherever its places lie, it sounds from the sphere, as what has been fitted does."""
-
-    def echo(self, positions, directions, bins, place=None):
-        assert place is None
-        towards = ((positions - MIDDLE) * directions).sum(-1)
-        return self.select(positions, directions, bins), RADIUS - towards
-
-
-def sounding(radius):
-    field = Sounding(REGION, FREQUENCY, spacing=SPACING, levels=1)
-    field.load_state_dict(lobes_on_a_sphere(radius).state_dict())
-    return field
-
-
-def sources_around(count=300, distance=0.4):
-    return MIDDLE + distance * sphere_directions(count, MIDDLE)
-
-
-def hull_of_the_sphere(count=300, radius=RADIUS):
-    """What the first echoes of the sphere leave, called and heard from one place each."""
-    sources = sources_around(count).double().numpy()
-    ways = sources - MIDDLE.double().numpy()
-    away = np.linalg.norm(ways, axis=1, keepdims=True)
-    return EchoHull(sources, sources[:, None], away - radius, -ways / away)
-
-
-def read(field, hull=None, method="filled", **options):
-    """Read out at once, with the range resolution that fits the blur of the field."""
-    hull = hull_of_the_sphere() if hull is None else hull
-    reading = read_field(field, hull, **{"resolution": 0.005, **options})
-    ((found, mesh),) = start_surfaces(reading, [method])
-    return finished_surface(mesh, found, reading)
-
-
 def cut(field, **options):
     """Return the iso-surface of a field."""
     mesh, volume, level = read_isosurface(field, **options)
     return Surface(mesh, volume, "isosurface", level=level)
 
 
-@pytest.mark.parametrize("method", ["open", "filled", "hull"])
-@pytest.mark.parametrize("spacing", [None, 0.0025])
-def test_the_surface_of_the_occupancy_is_the_sphere_and_says_who_heard_it(method, spacing):
-    found = read(sounding(0.012), method=method, spacing=spacing)
-    assert (found.method, found.level) == (method, None)
-    assert found.volume.spacing == pytest.approx(spacing or SPACING / 2)
-    assert np.abs(radii(found.mesh) - RADIUS).mean() < 0.8e-3
-    assert found.mesh.is_watertight
-    assert found.openness.kind == "closed"
-    assert found.confidence.shape == (len(found.mesh.vertices),)
-    assert found.confidence.max() > 10
-
-
-def test_where_the_field_is_silent_the_surface_lies_along_the_onsets():
-    """No pose hears the back of the sphere from the field; the onsets close it."""
-    field = sounding(RADIUS)
-    with torch.no_grad():
-        field.grids[0][0, 0, :, :, :13] = -20.0
-    found = read(field)
-    assert found.method == "filled"
-    assert found.mesh.is_watertight
-    silent = found.mesh.triangles_center[:, 0] < float(MIDDLE[0]) - 0.006
-    assert np.abs(radii(found.mesh) - RADIUS)[silent].mean() < SPACING / 4
-    back = found.mesh.vertices[:, 0] < float(MIDDLE[0]) - 0.9 * RADIUS
-    front = found.mesh.vertices[:, 0] > float(MIDDLE[0]) + 0.9 * RADIUS
-    assert found.confidence[back].max() == 0
-    assert found.confidence[front].min() > 0
-
-
-def test_the_hull_is_what_first_echoes_leave_whatever_the_field_says():
-    hull = hull_of_the_sphere()
-    found = read(sounding(0.012), method="hull")
-    # Between 300 heads hull and sphere part by 0.2 mm; straight lines add to it.
-    assert np.abs(radii(found.mesh) - RADIUS).max() < 0.0004
-    assert np.abs(hull.clearance(found.mesh.vertices)[0]).max() < 0.0001
-    mute = sounding(RADIUS)
-    mute.occupancy.zero_()
-    silent = read(mute, method="hull")
-    np.testing.assert_array_equal(silent.mesh.vertices, found.mesh.vertices)
-    assert silent.volume.values.max() == 0
-    assert not silent.confidence.any()
-
-
-def test_few_poses_leave_a_body_that_holds_the_true_one():
-    found = read(sounding(RADIUS), hull_of_the_sphere(20))
-    assert found.mesh.is_watertight
-    # Between 20 heads, 0.8 rad apart, the hull rises by 0.5² / 2 of the radius.
-    assert RADIUS - 0.001 < radii(found.mesh).min()
-    assert radii(found.mesh).max() < 1.2 * RADIUS
-
-
 def test_the_volume_holds_the_energy_where_it_is():
     field = lobes_on_a_sphere()
-    volume = read(field).volume
+    volume = energy_volume(field, None, 100)
     for spare in (REGION[0].numpy() - volume.origin, volume.upper - REGION[1].numpy()):
         assert (spare > -1e-6).all()
         assert (spare < SPACING / 2).all()
@@ -154,11 +67,9 @@ def test_the_volume_holds_the_energy_where_it_is():
     distance = np.linalg.norm(loud - MIDDLE.numpy(), axis=1)
     np.testing.assert_allclose(distance, RADIUS, atol=0.0015)
     places = torch.as_tensor(points[::997], dtype=torch.float32)
-    expected = field.oriented(places, 100)[0]
+    expected = field.energy(places, 100)
     np.testing.assert_allclose(volume.values.ravel()[::997], expected, rtol=1e-4)
-    alone = energy_volume(field, SPACING / 2, 100)
-    np.testing.assert_array_equal(alone.values, volume.values)
-    np.testing.assert_array_equal(alone.origin, volume.origin)
+    assert volume.spacing == pytest.approx(SPACING / 2)
 
 
 def test_a_field_without_lobes_is_read_at_a_level():
