@@ -32,7 +32,7 @@ from sononerf.refinement.objective import (
 from sononerf.refinement.optics import Heard, Optics
 from sononerf.refinement.remesh import MeshOperators, distance_from, smoothing_passes, unit
 from sononerf.refinement.tracer import Correction, LaterBounces, StillSurface, listen, sight_of
-from sononerf.start.surface import StartMethod
+from sononerf.start.network import StartMethod
 
 POSES = 8
 """Number of training poses per step."""
@@ -300,10 +300,9 @@ def planned(
     starts: Iterable[StartMethod], *, flat: bool = False
 ) -> list[tuple[StartMethod, Schedule]]:
     """Return the start and the schedule of each candidate."""
-    chosen = list(starts)
     pairs: list[tuple[StartMethod, Schedule]] = []
-    for name in chosen:
-        if not flat and (name != "levels" or "fuller" not in chosen):
+    for name in starts:
+        if not flat and name in ("fuller", "given"):
             pairs.append((name, "blurred"))
         pairs.append((name, "sharp"))
     return [("levels", "planes"), *pairs] if flat else pairs
@@ -349,14 +348,15 @@ def _better(candidates: list[Candidate]) -> Candidate:
     """Return the free candidate that explains the echoes best.
 
     In doubt, a sharp one, because the surfaces of the network are smooth, so that blur wears edges
-    and strokes away; of these a fuller one, because gaps stay and what is too thick becomes
-    thinner. A surface of the user's may be rough, and in doubt it goes on blurred.
+    and strokes away; of these a sheet, or else a fuller one, because gaps stay and what is too
+    thick becomes thinner. A surface of the user's may be rough, and in doubt it goes on blurred.
     """
     near = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
 
-    def order(one: Candidate) -> tuple[bool, bool, bool, float]:
+    def order(one: Candidate) -> tuple[bool, bool, int, float]:
         unfit = (one.schedule == "blurred") == (one.start != "given")
-        return one.objectives[-1] > near, unfit, one.start == "levels", one.objectives[-1]
+        start = ("sheet", "fuller", "levels", "given").index(one.start)
+        return one.objectives[-1] > near, unfit, start, one.objectives[-1]
 
     return min(candidates, key=order)
 

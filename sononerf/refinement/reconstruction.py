@@ -27,8 +27,8 @@ from sononerf.refinement.refine import Refinement, Saved
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import ReconstructionSettings, SimulationSettings
 from sononerf.simulation.simulator import Simulator
-from sononerf.start.network import levels_surfaces
-from sononerf.start.surface import LEVELS, StartMethod, Surface, surface_as_heard
+from sononerf.start.network import StartMethod, start_surfaces
+from sononerf.start.surface import Surface, surface_as_heard
 
 RAYS = 10_000
 """Rays per pose, for the correction of the last stage."""
@@ -88,16 +88,17 @@ def reconstruct(
 
 def _of_echoes(echoes: Echoes, progress: Progress, volume: Volume | None) -> Surface:
     """Return the surface that the network makes of echoes."""
-    made = levels_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
+    starts = start_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
+    mesh = starts["levels"]
     with _one_thread():
-        heard = poses_that_hear(made[0], echoes, Optics(echoes.head))
+        heard = poses_that_hear(mesh, echoes, Optics(echoes.head))
     surface = surface_as_heard(
-        made[0],
+        mesh,
         echoes,
         volume=volume,
         method="levels",
         confidence=heard.cpu().numpy().astype(np.int32),
-        starts=dict(zip(LEVELS, made, strict=True)),
+        starts=starts,
     )
     if surface.openness is not None and surface.openness.text:
         progress.say(surface.openness.text)
@@ -164,7 +165,7 @@ def refine(
         ).run()
     has_error = math.isfinite(refined.error_db)
     facts: dict[str, Any] = {
-        "method": surface.method,
+        "method": refined.start,
         "confidence": refined.confidence.round().astype(np.int32),
         "error": refined.error.astype(np.float32) if has_error else None,
         "refined": refined.kept,

@@ -47,7 +47,7 @@ from sononerf.refinement.remesh import finer, remesh
 from sononerf.refinement.surface_error import surface_error
 from sononerf.refinement.tracer import Correction, LaterBounces
 from sononerf.simulation.simulator import Simulator
-from sononerf.start.surface import LEVELS, StartMethod
+from sononerf.start.network import StartMethod
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ class Refinement:
 
     def _begun(self) -> list[Candidate]:
         """Return all candidates."""
-        network = [self.starts[name] for name in LEVELS if name in self.starts]
+        network = [self.starts[name] for name in ("levels", "fuller") if name in self.starts]
         flat = flattest([] if self.optics.plane else network, self._error, self.optics)
         candidates = []
         for start, schedule in planned(self.starts, flat=flat is not None):

@@ -13,9 +13,11 @@ References:
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -36,7 +38,11 @@ from sononerf.start.features import (
     features_of,
     free_places,
 )
+from sononerf.start.sheet import fit_sheet
 
+StartMethod = Literal["levels", "fuller", "sheet", "given"]
+"""Start of a refinement. ``levels``: the surface of the network. ``fuller``: that with gaps closed.
+``sheet``: a thin body through what the network finds. ``given``: a surface of the user's."""
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 """File of the trained weights, float16."""
 VOXEL = 0.25
@@ -204,15 +210,15 @@ def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, .
     return np.flip(made[0].numpy(), back).transpose(np.argsort(order))
 
 
-def levels_surfaces(
-    levels: RangeLevels | None, hull: EchoHull, box: Floats, resolution: float
-) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Return the closed surface of the body by the network, and a fuller one, m, normals outward.
+def start_surfaces(
+    levels: RangeLevels, hull: EchoHull, box: Floats, resolution: float
+) -> dict[StartMethod, trimesh.Trimesh]:
+    """Return the closed surfaces of the body by the network, m, normals outward.
+
+    A sheet is among them only if what the network finds lies on one.
 
     In: box ((2, 3), m), resolution (m).
     """
-    if levels is None:
-        raise NumericalError("the start levels needs the echoes; their free space is not enough")
     plane = hull.plane
     if plane is not None:
         levels, hull = levels.with_images(plane, len(hull.first)), hull.with_images()
@@ -222,16 +228,22 @@ def levels_surfaces(
     lattice = lattice_of(hull, box, resolution)
     if lattice is None:
         raise NumericalError("no surface: the first echoes leave no room for a body")
-    distance = predicted_distance(levels, hull, lattice)
+    distance, room = predicted_distance(levels, hull, lattice), clearance_grid(hull, lattice)
     if plane is not None:
-        height = plane.height(lattice.points()).reshape(lattice.shape) / lattice.spacing
-        distance = np.maximum(distance, -height).astype(np.float32)
+        height = plane.height(lattice.points()).reshape(lattice.shape)
+        distance = np.maximum(distance, -height / lattice.spacing).astype(np.float32)
+        room = np.minimum(room, height)
     if not (distance < SURE_DISTANCE).any():
         raise NumericalError("no surface: the network finds no body in the levels of the echoes")
-    level = expected_level(distance)
-    return _at_level(distance, level, lattice), _at_level(
-        distance, level + FULLER_DISTANCE, lattice
-    )
+    distance = distance - np.float32(expected_level(distance))
+    made: dict[StartMethod, trimesh.Trimesh] = {
+        "levels": _at_level(distance, 0.0, lattice),
+        "fuller": _at_level(distance, FULLER_DISTANCE, lattice),
+    }
+    probability = (1 / (1 + np.exp(distance.clip(-9, 9) / LOGIT))).astype(np.float32)
+    with suppress(NumericalError):
+        made["sheet"] = fit_sheet(probability, room, lattice, resolution)
+    return made
 
 
 def _at_level(distance: Singles, level: float, lattice: Lattice) -> trimesh.Trimesh:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import trimesh
@@ -23,15 +23,11 @@ from sononerf.geometry.lattice import Volume
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats
+from sononerf.start.network import StartMethod
 
 MeshFormat = Literal["ply", "stl", "glb"]
-StartMethod = Literal["levels", "fuller", "given"]
-"""Start of a refinement. ``levels``: the surface of the network (:mod:`sononerf.start.network`).
-``fuller``: that of the network with gaps closed. ``given``: a surface of the user's."""
-LEVELS: tuple[StartMethod, ...] = ("levels", "fuller")
-"""Start surfaces that the network makes at once."""
-Method = Literal["levels", "given", "isosurface"]
-"""Method of a surface: the start that was refined, or a level of the field's volume."""
+Method: TypeAlias = StartMethod | Literal["isosurface"]
+"""Method of a surface: its start, or a level of the field's volume."""
 MAX_SHEET_THICKNESS = 0.7
 """Distance of the other side below which a place is thin, range resolutions. The sides of a sheet
 share one echo, so neither is known to better than a fraction of the resolution."""

@@ -35,8 +35,8 @@ from sononerf.start.network import (
     StartNetwork,
     expected_level,
     lattice_of,
-    levels_surfaces,
     lots_of,
+    start_surfaces,
     without_hollows,
     without_small_parts,
 )
@@ -101,15 +101,19 @@ def apart(one, other):
     return np.median(cKDTree(dense).query(other.vertices)[0])
 
 
+def surfaces(levels, hull):
+    return start_surfaces(levels, hull, BOX, RESOLUTION)
+
+
 def test_two_spheres_are_seen_as_two():
-    found = levels_surfaces(*heard(around(80)), BOX, RESOLUTION)[0]
+    found = surfaces(*heard(around(80)))["levels"]
     assert found.is_watertight
     assert found.body_count == 2
     assert off(found, BALLS).mean() < 0.25 * RESOLUTION
 
 
 def test_the_fuller_surface_lies_outside():
-    one, fuller = levels_surfaces(*heard(around(80)), BOX, RESOLUTION)
+    one, fuller = (surfaces(*heard(around(80)))[name] for name in ("levels", "fuller"))
     assert fuller.is_watertight
     middle, radius = np.array(BALLS[0][:3]), BALLS[0][3]
     far = [np.linalg.norm(found.vertices - middle, axis=1) for found in (one, fuller)]
@@ -121,8 +125,8 @@ def test_a_turned_scene_gives_a_turned_surface():
     turn = random_rotation_matrix(np.array([0.2, 0.4, 0.7]))[:3, :3]
     balls = tuple((*(turn @ ball[:3]), ball[3]) for ball in BALLS)
     sources = around(80)
-    one = levels_surfaces(*heard(sources), BOX, RESOLUTION)[0]
-    other = levels_surfaces(*heard(sources @ turn.T, balls), BOX, RESOLUTION)[0]
+    one = surfaces(*heard(sources))["levels"]
+    other = surfaces(*heard(sources @ turn.T, balls))["levels"]
     one.vertices = one.vertices @ turn.T
     assert other.body_count == 2
     assert apart(one, other) < 0.1 * RESOLUTION
@@ -133,14 +137,14 @@ def test_poses_in_another_order_give_the_same_surface():
     sources = around(500)  # more than one pass takes
     assert len(lots_of(heard(sources)[0])) == 2
     order = np.random.default_rng(0).permutation(500)
-    one = levels_surfaces(*heard(sources), BOX, RESOLUTION)[0]
-    other = levels_surfaces(*heard(sources[order]), BOX, RESOLUTION)[0]
+    one = surfaces(*heard(sources))["levels"]
+    other = surfaces(*heard(sources[order]))["levels"]
     np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-4 * RESOLUTION)
 
 
 def test_lengths_are_seen_in_range_resolutions():
-    one = levels_surfaces(*heard(around(60)), BOX, RESOLUTION)[0]
-    large = levels_surfaces(*heard(around(60), scale=3.0), 3 * BOX, 3 * RESOLUTION)[0]
+    one = surfaces(*heard(around(60)))["levels"]
+    large = start_surfaces(*heard(around(60), scale=3.0), 3 * BOX, 3 * RESOLUTION)["levels"]
     np.testing.assert_allclose(large.vertices, 3 * one.vertices, atol=0.01 * RESOLUTION)
 
 
@@ -150,7 +154,7 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
     balls = (BALLS[0],)
     image = (0.0, 0.0, -0.07, 0.02)
     levels, hull = heard(above, (*balls, image), plane=table)
-    found = levels_surfaces(levels, hull, BOX, RESOLUTION)[0]
+    found = surfaces(levels, hull)["levels"]
     assert found.body_count == 1
     assert found.vertices[:, 2].min() < -0.018  # its underside is heard by the images alone
     assert off(found, balls).mean() < 0.25 * RESOLUTION
@@ -160,7 +164,7 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
 @pytest.mark.parametrize("sources", [around(1), around(60)[:20]], ids=["one pose", "one side"])
 def test_few_poses_give_a_surface(sources):
     levels, hull = heard(sources, BALLS[:1])
-    assert levels_surfaces(levels, hull, BOX / 2, RESOLUTION)[0].is_watertight
+    assert start_surfaces(levels, hull, BOX / 2, RESOLUTION)["levels"].is_watertight
 
 
 def formula(place, levels, onsets, table, resolution):
@@ -296,12 +300,7 @@ def test_without_room_for_a_body_there_is_no_surface():
     levels, hull = heard(around(60))
     late = dataclasses.replace(hull, first=hull.first + 0.2)
     with pytest.raises(NumericalError, match="no room"):
-        levels_surfaces(levels, late, BOX, RESOLUTION)
-
-
-def test_without_the_echoes_there_is_no_surface():
-    with pytest.raises(NumericalError, match="needs the echoes"):
-        levels_surfaces(None, heard(around(60))[1], BOX, RESOLUTION)
+        start_surfaces(levels, late, BOX, RESOLUTION)
 
 
 def test_the_weights_fit_the_network():

@@ -44,7 +44,7 @@ voxel would have no place inside."""
 LOWER_BAND = {"frequency_min": 20e3, "frequency_max": 50e3}
 """Band of every third head, Hz; the others have the default one. Lengths are in range resolutions,
 so that other bands are bodies of other sizes."""
-FEWEST, LEAST = 25, 12
+FEWEST, LEAST = 20, 12
 """Number of poses, at least, where some are drawn at random, and where those of one side are."""
 
 
@@ -247,18 +247,18 @@ def _poses(example: Example, random: np.random.Generator) -> Ints:
     """Return all poses, few of them, those of one side, or those of a belt."""
     emitters = example.levels.emitters
     count, which = len(emitters), random.random()
-    if which < 0.4:
+    if which < 0.35:
         return np.arange(count)
-    if which < 0.75:
+    if which < 0.65:
         few = min(FEWEST, count)
         few = int(few * (count / few) ** np.sqrt(random.random()))
         return np.sort(random.choice(count, few, replace=False))
     way = random.normal(size=3)
     along = trimesh.unitize(emitters) @ (way / np.linalg.norm(way))
-    if which < 0.92:
+    if which < 0.8:
         some = np.flatnonzero(along > random.uniform(-0.5, 0.6))
     else:
-        wide = random.uniform(0.15, 0.4)
+        wide = random.uniform(0.1, 0.5)
         some = np.flatnonzero(np.abs(along - random.uniform(-0.2, 0.5)) < wide)
     return some if len(some) >= LEAST else np.arange(count)
 
