@@ -27,7 +27,7 @@ from sononerf.refinement.refine import Refinement, Saved
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import ReconstructionSettings, SimulationSettings
 from sononerf.simulation.simulator import Simulator
-from sononerf.start.network import StartMethod, start_surfaces
+from sononerf.start.network import StartMethod, beyond_training, start_surfaces
 from sononerf.start.surface import Surface, surface_as_heard
 
 RAYS = 10_000
@@ -90,6 +90,8 @@ def _of_echoes(echoes: Echoes, progress: Progress, volume: Volume | None) -> Sur
     """Return the surface that the network makes of echoes."""
     starts = start_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
     mesh = starts["levels"]
+    if doubt := beyond_training(echoes.levels, echoes.bounds.mean(axis=0)):
+        progress.say(doubt)
     with _one_thread():
         heard = poses_that_hear(mesh, echoes, Optics(echoes.head))
     surface = surface_as_heard(

@@ -13,6 +13,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from functools import cache
 from itertools import pairwise
@@ -22,13 +23,14 @@ from typing import Literal
 import numpy as np
 import torch
 import trimesh
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from scipy import ndimage
 from torch import Tensor, nn
 
 from sononerf.echoes.detection import RangeLevels
 from sononerf.echoes.free_space import EchoHull
-from sononerf.errors import NumericalError
+from sononerf.errors import IncompatibleError, NumericalError
 from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
 from sononerf.numerics import Floats, Ints, Singles
 from sononerf.start.features import (
@@ -74,6 +76,9 @@ four frames raises the median F-score at 2 mm of 19 withheld bodies from 0.83 to
 from 0.59 to 0.65; eight frames give no more."""
 CHANNELS = (48, 80, 112, 144)
 """Channels of the network, from fine to coarse."""
+FEWEST_POSES, NARROWEST_CAP = 12, 53
+"""Number of poses, and half-angle of the cap that they lie on, degrees, at least in the
+training."""
 _RESOLVED = 8  # voxels of the smallest part
 _ROOM = 1.0  # distance in front of the onsets that the lattice covers, steps of the search
 
@@ -156,9 +161,18 @@ class StartNetwork(nn.Module):
 
 
 def trained_network() -> StartNetwork:
-    """Return the network with the weights of the package."""
+    """Return the network with the weights of the package.
+
+    Raises:
+        IncompatibleError: If they are those of another version, or damaged.
+    """
     network = StartNetwork()
-    network.load_state_dict({name: part.float() for name, part in load_file(WEIGHTS).items()})
+    try:
+        network.load_state_dict({name: part.float() for name, part in load_file(WEIGHTS).items()})
+    except (RuntimeError, SafetensorError, OSError):
+        raise IncompatibleError(
+            f"{WEIGHTS}: not the weights of the start network of this version; install it again"
+        ) from None
     return network.eval()
 
 
@@ -176,6 +190,28 @@ def expected_level(distance: Singles) -> float:
     near = distance[distance < SURE_DISTANCE].astype(np.float64)
     expected = int((1 / (1 + np.exp(near / LOGIT))).sum())
     return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE_DISTANCE
+
+
+def beyond_training(levels: RangeLevels, middle: Floats) -> str:
+    """Return in what the poses are unlike those of the training; empty if in nothing.
+
+    In: middle ((3,), m): Of the body.
+    """
+    if len(levels.poses) < FEWEST_POSES:
+        return (
+            f"{len(levels.poses)} training poses are fewer than the {FEWEST_POSES} that the start "
+            "network knows; its surface is taken all the same, and is a guess"
+        )
+    out = levels.emitters - middle
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    axis = out.mean(axis=0)
+    widest = math.degrees(math.acos(float((out @ axis).min() / max(np.linalg.norm(axis), 1e-9))))
+    if widest < NARROWEST_CAP:
+        return (
+            f"all poses lie within {widest:.0f} degrees of one direction, where the start network "
+            f"knows {NARROWEST_CAP} and more; its surface is taken all the same, and is a guess"
+        )
+    return ""
 
 
 def lots_of(levels: RangeLevels) -> list[Ints]:
