@@ -250,8 +250,6 @@ class Candidate:
     meshes: list[trimesh.Trimesh]  # The start, and the surface after each stage so far, m
     # Objectives of these on the validation poses; NaN for a start that was not compared
     objectives: list[float]
-    # m: Range resolution. A surface that is farther from its start at the median is torn
-    far: float = math.inf
     # Number of its steps so far; it determines their poses, so that a candidate does not depend on
     # the others
     drawn: int = 0
@@ -282,12 +280,9 @@ class Candidate:
         return self.objectives[self.best]
 
     def torn(self, number: int) -> bool:
-        """Whether a surface has more parts than its start, or is farther from it than ``far``."""
+        """Whether a surface has more parts than its start."""
         if number not in self._torn:
-            start, mesh = self.meshes[0], self.meshes[number]
-            self._torn[number] = parts_of(mesh) > parts_of(start) or (
-                float(np.median(distances(mesh, start))) > self.far
-            )
+            self._torn[number] = parts_of(self.meshes[number]) > parts_of(self.meshes[0])
         return self._torn[number]
 
 
@@ -337,28 +332,11 @@ def after_first_stage(
         first, second = np.argsort(errors, kind="stable")
         clear = CHANCE_RATIO * errors[first] < errors[second]
         return [pair[first]] if clear else [pair[first], pair[second]]
-    best = _better(candidates)
+    best = min(candidates, key=lambda one: one.objectives[-1])
     if best.start == "fuller":  # it goes on as levels, and is compared with that start
         best.start = "levels"
         best.meshes[0] = next(one.meshes[0] for one in candidates if one.start == "levels")
     return [best]
-
-
-def _better(candidates: list[Candidate]) -> Candidate:
-    """Return the free candidate that explains the echoes best.
-
-    In doubt, a sharp one, because the surfaces of the network are smooth, so that blur wears edges
-    and strokes away; of these a sheet, or else a fuller one, because gaps stay and what is too
-    thick becomes thinner. A surface of the user's may be rough, and in doubt it goes on blurred.
-    """
-    near = CHANCE_RATIO * min(one.objectives[-1] for one in candidates)
-
-    def order(one: Candidate) -> tuple[bool, bool, int, float]:
-        unfit = (one.schedule == "blurred") == (one.start != "given")
-        start = ("sheet", "fuller", "levels", "given").index(one.start)
-        return one.objectives[-1] > near, unfit, start, one.objectives[-1]
-
-    return min(candidates, key=order)
 
 
 def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:

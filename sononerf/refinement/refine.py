@@ -112,7 +112,6 @@ class Refinement:
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
-        self._far = optics.head.resolution
         self._later: tuple[Candidate, LaterBounces] | None = None
         self.candidates = self._begun()
 
@@ -218,7 +217,7 @@ class Refinement:
         candidates = []
         for start, schedule in planned(self.starts, flat=flat is not None):
             mesh = flat if schedule == "planes" and flat is not None else self.starts[start]
-            begun = Candidate(schedule, start, self._new_level(), [mesh], [math.nan], self._far)
+            begun = Candidate(schedule, start, self._new_level(), [mesh], [math.nan])
             candidates.append(begun)
         return candidates
 
