@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,6 @@ from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
-from sononerf.numerics import Floats
 from sononerf.refinement.objective import (
     ONSET_WEIGHT,
     ErrorLevel,
@@ -30,7 +29,7 @@ from sononerf.refinement.objective import (
     mismatch,
 )
 from sononerf.refinement.optics import Heard, Optics
-from sononerf.refinement.remesh import MeshOperators, distance_from, smoothing_passes, unit
+from sononerf.refinement.remesh import MeshOperators, smoothing_passes, unit
 from sononerf.refinement.tracer import Correction, LaterBounces, StillSurface, listen, sight_of
 from sononerf.start.network import StartMethod
 
@@ -217,23 +216,6 @@ SHARP_EDGE = 0.5
 """Edge length of the triangles if the surface is not blurred, shortest wavelengths. The first stage
 runs both blurred and sharp, and the surface that explains the validation poses better continues.
 Blur removes dents and necks, but also edges, sheets and wires."""
-
-
-CHANCE_RATIO = 1.15
-"""Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
-a refined surface is preferred to its start."""
-RANKS_DB = 4.0
-"""Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
-are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
-too (``docs/notes/surface.md``). So above it a torn surface loses against its start, and of the
-surfaces of ``levels`` the earliest one within ``CHANCE_RATIO`` of the best is kept."""
-SAME_SURFACE_DISTANCE = 1 / 16
-"""Mean distance below which two surfaces sound alike, shortest wavelengths: the path there and back
-counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
-LATER_STAGE_RATIO = 1.03
-"""Ratio of two objectives of one candidate below which the later stage is preferred: on smooth
-bodies later stages are nearer to the truth at the same objective. Edges lose in later stages, and
-there the objective rises by 5 % and more (beaker, star)."""
 Schedule = Literal["blurred", "sharp", "planes"]
 """How a surface goes through the stages. ``blurred``: with the blur and the edges of each stage,
 unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``planes``:
@@ -253,37 +235,16 @@ class Candidate:
     # Number of its steps so far; it determines their poses, so that a candidate does not depend on
     # the others
     drawn: int = 0
-    _torn: dict[int, bool] = field(default_factory=dict, repr=False)
 
     @property
     def best(self) -> int:
-        """Number of the best surface: 0, the start, where all refined ones are clearly worse.
-
-        Of surfaces that explain the echoes about as well it is the latest one; but the earliest one
-        of ``levels`` where the objective hardly ranks.
-        """
-        start, *refined = self.objectives
-        refined = [
-            math.inf if one > RANKS_DB and self.torn(number) else one
-            for number, one in enumerate(refined, 1)
-        ]
-        least = min(refined, default=math.inf)
-        if math.isinf(least) or least > CHANCE_RATIO * start:
-            return 0
-        if self.start == "levels" and self.schedule != "planes" and least > RANKS_DB:
-            return next(n for n, one in enumerate([start, *refined]) if one <= CHANCE_RATIO * least)
-        return max(n for n, found in enumerate(refined, 1) if found <= LATER_STAGE_RATIO * least)
+        """Number of the surface with the least objective: 0 for the start, from 1 on for stages."""
+        return int(np.nanargmin(self.objectives))
 
     @property
     def objective(self) -> float:
         """Objective of the best surface, dB."""
         return self.objectives[self.best]
-
-    def torn(self, number: int) -> bool:
-        """Whether a surface has more parts than its start."""
-        if number not in self._torn:
-            self._torn[number] = parts_of(self.meshes[number]) > parts_of(self.meshes[0])
-        return self._torn[number]
 
 
 def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
@@ -318,47 +279,15 @@ def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = S
     return len(planned(starts)) * stages[0].steps + sum(stage.steps for stage in stages[1:])
 
 
-def after_first_stage(
+def best_after_first_stage(
     candidates: list[Candidate], misfit: Callable[[trimesh.Trimesh], float]
-) -> list[Candidate]:
-    """Return the candidates that go on after the first stage, the best one first.
+) -> Candidate:
+    """Return the candidate that goes on: the one with the least objective.
 
-    Of planes and the best of the others the better one goes on, in doubt both; only their errors
-    count, because free surfaces follow the onsets and planes do not.
+    Planes are compared with it by the errors of the echoes alone, because free surfaces follow the
+    onsets and planes do not.
     """
-    if candidates[0].schedule == "planes" and len(candidates) > 1:
-        pair = [candidates[0], *after_first_stage(candidates[1:], misfit)]
-        errors = [one.objectives[-1] - misfit(one.meshes[-1]) for one in pair]
-        first, second = np.argsort(errors, kind="stable")
-        clear = CHANCE_RATIO * errors[first] < errors[second]
-        return [pair[first]] if clear else [pair[first], pair[second]]
-    best = min(candidates, key=lambda one: one.objectives[-1])
-    if best.start == "fuller":  # it goes on as levels, and is compared with that start
-        best.start = "levels"
-        best.meshes[0] = next(one.meshes[0] for one in candidates if one.start == "levels")
-    return [best]
-
-
-def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
-    """Return True if two surfaces sound alike after the first stage, at the shortest wavelength."""
-    return (
-        float(distances(one.meshes[1], other.meshes[1]).mean())
-        <= SAME_SURFACE_DISTANCE * wavelength
-    )
-
-
-def best_of(candidates: list[Candidate]) -> Candidate:
-    """Return the candidate of the least objective."""
-    return min(candidates, key=lambda one: one.objective)
-
-
-def parts_of(mesh: trimesh.Trimesh) -> int:
-    """Return the number of parts with more than 1 % of the area of the largest one."""
-    areas = [part.area for part in mesh.split(only_watertight=False)]
-    return int(np.sum(np.asarray(areas) > 0.01 * max(areas, default=0.0)))
-
-
-def distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> Floats:
-    """Return the distance of each vertex of a mesh from another one, (V,) m."""
-    spacing = float(np.median(other.edges_unique_length))
-    return distance_from(other, np.asarray(mesh.vertices), spacing)
+    free = [one for one in candidates if one.schedule != "planes"]
+    pair = [one for one in candidates if one.schedule == "planes"]
+    pair += [min(free, key=lambda one: one.objectives[-1])] if free else []
+    return min(pair, key=lambda one: one.objectives[-1] - misfit(one.meshes[-1]))

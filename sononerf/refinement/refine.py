@@ -31,10 +31,8 @@ from sononerf.refinement.descent import (
     Candidate,
     Descent,
     Stage,
-    after_first_stage,
-    are_alike,
     below,
-    best_of,
+    best_after_first_stage,
     planned,
     poses_that_hear,
     without_twin,
@@ -118,28 +116,21 @@ class Refinement:
     def run(self) -> Refined:
         """Return the surface that explains the validation poses best.
 
-        Every candidate goes through the first stage, and one or two of them through the others, see
-        :func:`~sononerf.refinement.descent.after_first_stage`.
+        Every candidate goes through the first stage, and the best one through the others.
         """
         self.first_stage()
-        first, *_ = self.candidates
-        for candidate in self.candidates:
-            if candidate is first or not are_alike(candidate, first, self.optics.wavelength):
-                for number in range(1, len(self.stages)):
-                    self.stage(candidate, number)
+        for number in range(1, len(self.stages)):
+            self.stage(self.candidates[0], number)
         return self.result()
 
     def first_stage(self) -> None:
-        """Do the first stage of all candidates, and leave those that lose."""
+        """Do the first stage of all candidates, and keep the best one."""
         for candidate in list(self.candidates):
             if candidate in self.candidates:
                 self.stage(candidate, 0)
-        self.candidates = after_first_stage(self.candidates, self.comparison.misfit)
-        for candidate in self.candidates:
-            if math.isnan(candidate.objectives[0]):
-                # Planes may have begun from the fuller surface; they compete with levels.
-                candidate.meshes[0] = self.starts[candidate.start]
-                candidate.objectives[0] = self._compared(candidate.start)
+        best = best_after_first_stage(self.candidates, self.comparison.misfit)
+        best.objectives[0] = self._objective(best.meshes[0], f"the start {best.start}")
+        self.candidates = [best]
 
     def stage(self, candidate: Candidate, number: int) -> None:
         """Do a stage of a candidate, or take it from the saved ones."""
@@ -224,11 +215,6 @@ class Refinement:
     def _new_level(self) -> ErrorLevel:
         like = self.optics.get_buffer("wavenumber")
         return ErrorLevel(self.optics.ears, len(self.optics.frequencies), like)
-
-    def _compared(self, name: StartMethod) -> float:
-        """Return the objective of a start."""
-        mesh, level = self.starts[name], self._new_level()
-        return self._objective(mesh, f"the start {name}", level, smooth=False)
 
     def _objective(
         self,
@@ -328,7 +314,7 @@ class Refinement:
 
     def result(self) -> Refined:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
-        candidate = best_of(self.candidates)
+        (candidate,) = self.candidates
         best = candidate.best
         mesh = candidate.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()

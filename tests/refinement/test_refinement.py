@@ -301,46 +301,33 @@ def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
 @pytest.mark.parametrize(
     ("objectives", "best"),
     [
-        ((9.0, 5.0, 5.1, 5.4), 2),  # of equals the later one; a rise is none
         ((9.0, 5.0, 5.4, 4.0), 3),
-        ((4.0, 5.0, 4.4, 4.3), 3),  # the start is better by chance
-        ((4.0, 5.0, 6.0, 4.7), 0),  # no stage explains as much as the start
+        ((9.0, 5.0, 5.1, 5.4), 1),
+        ((4.0, 5.0, 4.4, 4.3), 0),
         ((math.inf, 5.0, math.inf), 1),  # what cannot be traced
         ((math.inf, math.inf), 0),
         ((4.0,), 0),
     ],
 )
-def test_the_later_of_equal_surfaces_is_kept(bumpy, objectives, best):
+def test_the_surface_with_the_least_objective_is_kept(bumpy, objectives, best):
     candidate = Candidate("sharp", "given", None, [bumpy] * len(objectives), list(objectives))
     assert candidate.best == best
 
 
-@pytest.mark.parametrize(
-    ("objectives", "best"),
-    [
-        ((9.0, 5.0, 4.8, 4.7), 1),  # the earliest that explains about as much
-        ((9.0, 6.0, 5.0, 4.7), 2),
-        ((5.0, 5.2, 4.8, 4.7), 0),
-        ((5.0, 2.9, 2.85, 2.8), 3),  # it ranks rightly
-    ],
-)
-def test_where_the_error_hardly_ranks_the_earliest_surface_of_levels_is_kept(
-    bumpy, objectives, best
-):
-    candidate = Candidate("sharp", "levels", None, [bumpy] * len(objectives), list(objectives))
-    assert candidate.best == best
+def test_planes_are_compared_with_free_surfaces_without_their_onsets(bumpy):
+    def candidate(schedule, objective, misfit):
+        mesh = bumpy.copy()
+        mesh.metadata["misfit"] = misfit
+        return Candidate(schedule, "levels", None, [bumpy, mesh], [math.nan, objective])
 
+    def misfit(mesh):
+        return mesh.metadata["misfit"]
 
-@pytest.mark.parametrize(("error", "kept"), [(6.0, False), (3.0, True)])
-def test_a_torn_surface_loses_unless_its_error_is_low(bumpy, error, kept):
-    other = bumpy.copy()
-    other.apply_translation([0.1, 0, 0])
-    in_two = trimesh.util.concatenate([bumpy, other])
-    moved = bumpy.copy()
-    moved.apply_scale(2.0)
-    for mesh in (in_two, moved):
-        candidate = Candidate("sharp", "given", None, [bumpy, mesh], [9.0, error], 0.006)
-        assert (candidate.best > 0) == kept
+    planes, near = candidate("planes", 6.0, 3.0), candidate("sharp", 5.0, 1.0)
+    far = candidate("blurred", 5.5, 3.0)
+    assert best_after_first_stage([planes, near, far], misfit) is planes
+    assert best_after_first_stage([near, far], misfit) is near
+    assert best_after_first_stage([candidate("planes", 6.0, 1.0), near, far], misfit) is near
 
 
 @pytest.fixture(scope="module")
