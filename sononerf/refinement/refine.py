@@ -322,7 +322,7 @@ class Refinement:
             mesh,
             self.echoes,
             self.optics,
-            starts=[mesh for name, mesh in self.starts.items() if name != "fuller"],
+            starts=list(self.starts.values()),
             validation_db=candidate.objective,
             seed=self.seed,
         )
