@@ -31,8 +31,8 @@ from sononerf.refinement.descent import (
     Candidate,
     Descent,
     Stage,
+    after_first_stage,
     below,
-    best_after_first_stage,
     planned,
     poses_that_hear,
     without_twin,
@@ -116,21 +116,24 @@ class Refinement:
     def run(self) -> Refined:
         """Return the surface that explains the validation poses best.
 
-        Every candidate goes through the first stage, and the best one through the others.
+        Every candidate goes through the first stage, and one or two of them through the others,
+        see :func:`~sononerf.refinement.descent.after_first_stage`.
         """
         self.first_stage()
-        for number in range(1, len(self.stages)):
-            self.stage(self.candidates[0], number)
+        for candidate in self.candidates:
+            for number in range(1, len(self.stages)):
+                self.stage(candidate, number)
         return self.result()
 
     def first_stage(self) -> None:
-        """Do the first stage of all candidates, and keep the best one."""
+        """Do the first stage of all candidates, and leave those that lose."""
         for candidate in list(self.candidates):
             if candidate in self.candidates:
                 self.stage(candidate, 0)
-        best = best_after_first_stage(self.candidates, self.comparison.misfit)
-        best.objectives[0] = self._objective(best.meshes[0], f"the start {best.start}")
-        self.candidates = [best]
+        self.candidates = after_first_stage(self.candidates, self.comparison.misfit)
+        for candidate in self.candidates:
+            start = f"the start {candidate.start}"
+            candidate.objectives[0] = self._objective(candidate.meshes[0], start)
 
     def stage(self, candidate: Candidate, number: int) -> None:
         """Do a stage of a candidate, or take it from the saved ones."""
@@ -314,7 +317,7 @@ class Refinement:
 
     def result(self) -> Refined:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
-        (candidate,) = self.candidates
+        candidate = min(self.candidates, key=lambda one: one.objective)
         best = candidate.best
         mesh = candidate.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
