@@ -42,15 +42,6 @@ def fibonacci_cap(
     return CapSpiral(count, axis, half_angle, offset).directions()
 
 
-def usual_gap(count: int) -> float:
-    """Return the usual radius of the largest gap between random directions, rad.
-
-    The radius is the angle from the middle of the gap to the nearest direction. Caps of this
-    radius around all directions have log(count) times the area of the sphere.
-    """
-    return math.acos(max(1.0 - 2.0 * math.log(count) / count, -1.0)) if count > 1 else math.pi
-
-
 @dataclass(frozen=True, eq=False)
 class Cells:
     """Parallelograms on the plane of (share of a cap's area, turn about its axis)."""

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 from skimage.filters import threshold_otsu
 from skimage.measure import marching_cubes
 
 from sononerf.errors import NumericalError
-from sononerf.numerics import Floats, Singles
+from sononerf.numerics import Floats
 from sononerf.resources import require_memory
 
 MARGIN = 3
@@ -42,23 +42,6 @@ class Lattice:
     def points(self) -> Floats:
         """Return the centres of all voxels, (N, 3) m."""
         return self.origin + self.spacing * np.argwhere(np.ones(self.shape, dtype=bool))
-
-    def spread(self, points: Floats, values: Floats, deviation: float = 0.0) -> Singles:
-        """Add values (N,) of points to the voxels around them, and blur by a number of voxels."""
-        place = self.coordinates(points)
-        base = np.floor(place).astype(np.intp)
-        fraction = place - base
-        within = ((base >= 0) & (base < np.asarray(self.shape) - 1)).all(axis=1)
-        base, fraction, values = base[within], fraction[within], values[within]
-        total = np.zeros(int(np.prod(self.shape)))
-        for corner in np.ndindex(2, 2, 2):
-            part = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
-            flat = np.ravel_multi_index(tuple((base + np.asarray(corner)).T), self.shape)
-            total += np.bincount(flat, values * part, total.size)
-        grid = total.reshape(self.shape).astype(np.float32)
-        if deviation:
-            grid = gaussian_filter(grid, deviation, mode="constant")
-        return np.asarray(grid, dtype=np.float32)
 
     def read(self, grid: NDArray[np.floating], points: Floats) -> Floats:
         """Read a grid at points, linearly between voxels, (N,)."""
