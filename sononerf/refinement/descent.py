@@ -279,8 +279,10 @@ def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Cand
 
 
 def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
-    """Return the steps of a refinement of start methods, at most, without flat parts."""
-    return len(planned(starts)) * stages[0].steps + sum(stage.steps for stage in stages[1:])
+    """Return the steps of a refinement of start methods, at most: planes may go on too."""
+    pairs = planned(starts)
+    going_on = 2 if ("levels", "sharp") in pairs else 1
+    return len(pairs) * stages[0].steps + going_on * sum(stage.steps for stage in stages[1:])
 
 
 def after_first_stage(

@@ -59,8 +59,7 @@ class Refined:
     confidence: Floats
     error: Floats  # (V,), m: See :mod:`sononerf.refinement.surface_error`
     start: StartMethod  # Name of the start that was refined
-    # True where the refined surface explains the validation poses about as well as the start, or
-    # better
+    # True where the refined surface explains the validation poses better than the start
     kept: bool
     # Objective on validation poses, see :class:`~sononerf.refinement.objective.Comparison`
     error_db: float

@@ -205,7 +205,8 @@ def beyond_training(levels: RangeLevels, middle: Floats) -> str:
     out = levels.emitters - middle
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     axis = out.mean(axis=0)
-    widest = math.degrees(math.acos(float((out @ axis).min() / max(np.linalg.norm(axis), 1e-9))))
+    least = float((out @ axis).min() / max(np.linalg.norm(axis), 1e-9))
+    widest = math.degrees(math.acos(max(-1.0, min(least, 1.0))))
     if widest < NARROWEST_CAP:
         return (
             f"all poses lie within {widest:.0f} degrees of one direction, where the start network "

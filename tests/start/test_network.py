@@ -10,12 +10,13 @@ import pytest
 import torch
 import trimesh
 from safetensors.torch import load_file
+from safetensors.torch import save as safetensors_bytes
 from scipy.spatial import cKDTree
 from trimesh.transformations import random_rotation_matrix
 
 from sononerf.echoes.detection import RangeLevels
 from sononerf.echoes.free_space import EchoHull
-from sononerf.errors import NumericalError
+from sononerf.errors import IncompatibleError, NumericalError
 from sononerf.geometry.meshes import Plane
 from sononerf.start import network
 from sononerf.start.features import (
@@ -33,6 +34,7 @@ from sononerf.start.network import (
     LOGIT,
     VOXEL,
     StartNetwork,
+    beyond_training,
     expected_level,
     lattice_of,
     lots_of,
@@ -321,3 +323,28 @@ def test_hollows_are_filled_and_parts_of_few_voxels_left_out():
     alone = np.ones_like(distance)
     alone[15, 15, 15:18] = -1.0
     np.testing.assert_array_equal(without_small_parts(alone), alone)
+
+
+@pytest.mark.parametrize(
+    ("sources", "said"),
+    [
+        (around(80), ""),
+        (around(6), "6 training poses are fewer than the 12"),
+        (np.tile([[0.1, 0.2, 0.3]], (20, 1)), "within 0 degrees of one direction"),
+        (around(400)[:20], "degrees of one direction"),
+        (around(400)[:120], ""),
+    ],
+    ids=["all around", "few", "one place", "narrow cap", "wide cap"],
+)
+def test_poses_unlike_those_of_the_training_are_told(sources, said):
+    found = beyond_training(heard(sources)[0], np.zeros(3))
+    assert said in found if said else found == ""
+
+
+def test_weights_of_another_version_are_refused(tmp_path, monkeypatch):
+    file = tmp_path / "network.safetensors"
+    monkeypatch.setattr(network, "WEIGHTS", file)
+    for content in (b"", b"none of it", safetensors_bytes({"other": torch.zeros(2)})):
+        file.write_bytes(content)
+        with pytest.raises(IncompatibleError, match="not the weights of the start network"):
+            network.trained_network()
