@@ -151,8 +151,7 @@ def row(name, levels, other, result, calls=400):
         "result": score(result),
         "chosen": "levels",
         "kept": result != levels,
-        "fit_s": 20.0,
-        "surface_s": 40.0,
+        "surface_s": 60.0,
     }
 
 

@@ -22,10 +22,10 @@ and the area under the sparsification error, beside that of the numbers of poses
 seeds 1 to 4 lie beside that of seed 0, of how far their surfaces lie apart.
 
 ``surfaces``: how good the surfaces of all kinds of scenes are, some under changed conditions; one
-line of JSON for each run. With ``--foreign`` all bodies of a folder are reconstructed instead, and
-each start surface and each candidate of the refinement is compared with the truth too. It leaves
-runs, a table and logs in a folder (``--output``), shares ensembles (``--data``), goes on where it
-was interrupted, and lays KEY=VALUE over the settings (``--set``).
+line of JSON for each run. With ``--foreign`` all bodies of a folder are reconstructed instead, of
+echoes alone, and each start surface and each candidate of the refinement is compared with the truth
+too. It leaves runs, a table and logs in a folder (``--output``), shares ensembles (``--data``),
+goes on where it was interrupted, and lays KEY=VALUE over the settings (``--set``).
 """
 
 from __future__ import annotations
