@@ -169,7 +169,7 @@ def test_the_table_shows_starts_candidates_and_result_and_what_a_right_choice_wo
     assert [line[:2] for line in lines if line[1] == "calls"] == [["400", "calls"], ["25", "calls"]]
 
 
-def test_the_page_has_one_commit_and_one_number_of_calls(tmp_path):
+def test_the_page_has_one_commit_and_all_numbers_of_calls(tmp_path):
     other = {"name": "randoma", "calls": 400, "commit": "abc", "machine": "m", **REFINED}
     lines = [other, {**other, "name": "randomb", "calls": 25}]
     text = "\n".join(json.dumps(line) for line in lines)
@@ -177,7 +177,9 @@ def test_the_page_has_one_commit_and_one_number_of_calls(tmp_path):
     page, readme = tmp_path / "results.md", tmp_path / "README.md"
     write_page(tmp_path, page, readme)
     assert "commit abc" in page.read_text()
-    assert "1 closed bodies" in page.read_text()
+    assert "2 closed bodies" in page.read_text()
+    assert "| **result** | **0.80 · 0.80 · 0.80** | **0.80 · 0.80 · 0.80** |" in page.read_text()
+    assert "--calls 400 25\n" in page.read_text()
     assert "| a | 0.50 | 0.80 | 1.00 mm | 1 (2) | `levels`, unrefined |" in page.read_text()
     (tmp_path / "foreign.jsonl").write_text(
         f"{text}\n{json.dumps({**other, 'commit': 'd', 'name': 'c'})}"

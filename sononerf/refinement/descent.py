@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
@@ -52,6 +53,9 @@ VISIBILITY_STEPS = 4
 STANDING_HEIGHT = 0.1
 """Height over the support up to which a vertex stays on it, edges. Surfaces are cut at the support
 to within a small part of an edge."""
+MIN_THICKNESS = 0.15
+"""Least thickness of a wall, shortest wavelengths. A thinner one sounds the same, but its sides
+could change places, and each would hide the other: a leaf lost a third of itself so."""
 MIN_SUPPORT = 0.5
 """Fade and spread at the lowest frequency above which a pose supports a vertex."""
 
@@ -92,6 +96,7 @@ class Descent:
         self._sight: Occlusion | None = None
         self._later, self._correction, self._onsets = later, correction, onsets
         self.rate, self.band = rate, band
+        self._walls = Walls(mesh, MIN_THICKNESS * optics.wavelength)
         if optics.plane is not None:  # no vertex goes below it, and vertices on it stay there
             self._stands = optics.plane.height(self.vertices) < STANDING_HEIGHT * edge
 
@@ -118,6 +123,7 @@ class Descent:
         move = self.operators.smoothed(move, self.strength)
         self.vertices = self.vertices - rate * move.clamp(-4.0, 4.0) * normals
         self.vertices = self.operators.relaxed(self.vertices, normals, TANGENTIAL_FRACTION)
+        self.vertices = self._walls.apart(self.vertices, normals)
         if (plane := self.optics.plane) is not None:
             height = plane.height(self.vertices)
             off = torch.where(self._stands, height, height.clamp_max(0.0))[:, None]
@@ -169,6 +175,33 @@ class Descent:
         if self._onsets is not None:
             total = total + ONSET_WEIGHT * self._onsets.gradient(self.vertices, number)
         return (total * normals).sum(1, keepdim=True), float(errors.detach().mean())
+
+
+_OPPOSED = -0.5  # cosine between the normals of the two sides of a wall, at most
+_AROUND = 16  # number of vertices among which the opposite one is searched for
+
+
+class Walls:
+    """Pairs of opposite vertices of thin walls, which stay apart. In: least thickness (m)."""
+
+    def __init__(self, mesh: trimesh.Trimesh, least: float) -> None:
+        places, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+        _, near = cKDTree(places).query(places, k=min(_AROUND, len(places)))
+        opposed = np.einsum("vkd,vd->vk", normals[near], normals) < _OPPOSED
+        some = np.flatnonzero(opposed.any(axis=1))
+        self._vertex = torch.as_tensor(some)
+        self._other = torch.as_tensor(near[some, opposed[some].argmax(axis=1)])
+        self._least = least
+
+    def apart(self, vertices: Tensor, normals: Tensor) -> Tensor:
+        """Return the vertices (V, 3), moved outward where a wall is too thin.
+
+        In: vertices ((V, 3), m), normals (V, 3).
+        """
+        one, other = (part.to(vertices.device) for part in (self._vertex, self._other))
+        gap = ((vertices[one] - vertices[other]) * normals[one]).sum(1, keepdim=True)
+        short = (self._least - gap).clamp_min(0.0)
+        return vertices.index_add(0, one, 0.5 * short * normals[one])
 
 
 def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Tensor:

@@ -7,6 +7,7 @@ import json
 import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,6 @@ PAGE, README = ROOT / "docs" / "results.md", ROOT / "README.md"
 MARKS = ("<!-- numbers -->", "<!-- end of the numbers -->")
 """Lines of the README between which its table stands."""
 BOTH = ("three_spheres", "ua")
-CALLS = 400
-"""Calls of the bodies of others that are on the page."""
 HEAD = """# Results
 
 Written by `python tools/benchmark.py surfaces --page`
@@ -44,6 +43,11 @@ surfaces was chosen with these results in view, so the figures are slightly too 
 ```sh
 python tools/benchmark.py surfaces --foreign FOLDER --calls {calls}
 ```
+
+Of echoes alone, without a field. `levels` and `fuller` are two levels of the network's probability,
+`sheet` the one height that is fitted to it; the row of a start is that surface, not refined.
+F-scores at 2 mm: median · least · mean.
+
 """
 OWN = """
 ## Scenes of this project
@@ -60,7 +64,7 @@ def write_page(output: Path, page: Path = PAGE, readme: Path = README) -> str:
     """Write the page and the README's table from the rows and runs in a folder."""
     own = [row for row in rows_of(output / "surfaces.jsonl") if "failed" not in row]
     own = [row for row in own if row["seed"] == 0]
-    foreign = [row for row in rows_of(output / "foreign.jsonl") if row["calls"] == CALLS]
+    foreign = rows_of(output / "foreign.jsonl")
     commits = sorted({row["commit"] for row in (*own, *foreign)})
     if not commits:
         raise SystemExit(f"error: {output}: holds no finished rows (surfaces.jsonl, foreign.jsonl)")
@@ -69,7 +73,10 @@ def write_page(output: Path, page: Path = PAGE, readme: Path = README) -> str:
     machine = (own or foreign)[0]["machine"]
     text = HEAD.format(commit=commits[0], machine=machine)
     if foreign:
-        text += FOREIGN.format(count=len(foreign), calls=CALLS) + _foreign_tables(foreign)
+        calls = sorted({row["calls"] for row in foreign}, reverse=True)
+        count = len({row["name"] for row in foreign})
+        text += FOREIGN.format(count=count, calls=" ".join(map(str, calls)))
+        text += _foreign_tables(foreign, calls)
     if own:
         text += OWN.format(names=" ".join(row["name"] for row in own)) + _own_table(own)
     runs = {name: output / f"{name}-0" / "metrics.json" for name in BOTH}
@@ -89,26 +96,41 @@ def _table(lines: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in (lines[0], rule, *lines[1:]))
 
 
-def _foreign_tables(rows: Sequence[Row]) -> str:
-    def spread(of: Callable[[Row], float | None]) -> str:
-        scores = [score for row in rows if (score := of(row)) is not None]
-        middle, least, mean = statistics.median(scores), min(scores), statistics.fmean(scores)
-        some = "" if len(scores) == len(rows) else f" (of {len(scores)})"
-        return f"{middle:.2f} · {least:.2f} · {mean:.2f}{some}"
+def _foreign_tables(rows: Sequence[Row], calls: Sequence[int]) -> str:
+    """Return a table by number of calls, and one by body for the largest number."""
 
-    def start(name: str) -> Callable[[Row], float | None]:
-        return lambda row: row["starts"].get(name, {}).get("fscore_2mm")
+    def line(title: str, shown: Callable[[list[Row]], str]) -> list[str]:
+        return [title, *(shown([row for row in rows if row["calls"] == one]) for one in calls)]
+
+    def spread(some: Sequence[Row], start: str | None = None) -> str:
+        surfaces = [row["starts"].get(start) if start else row["result"] for row in some]
+        scores = [surface["fscore_2mm"] for surface in surfaces if surface]
+        if not scores:
+            return "-"
+        of = "" if len(scores) == len(some) else f" (of {len(scores)})"
+        middle, least, mean = statistics.median(scores), min(scores), statistics.fmean(scores)
+        return f"{middle:.2f} · {least:.2f} · {mean:.2f}{of}"
+
+    def median(some: Sequence[Row], key: str) -> float:
+        return statistics.median(row["result"][key] for row in some)
+
+    def wrong(some: Sequence[Row]) -> str:
+        return str(sum(row["result"]["parts"] != row["result"]["parts_true"] for row in some))
 
     present = [name for name in STARTS if any(name in row["starts"] for row in rows)]
     summary = [
-        ["F-score at 2 mm", "median · least · mean"],
-        ["**result**", f"**{spread(lambda row: row['result']['fscore_2mm'])}**"],
-        *([f"start `{name}`", spread(start(name))] for name in present),
+        ["", *(f"{one} calls" for one in calls)],
+        line("**result**", lambda some: f"**{spread(some)}**"),
+        *(line(f"start `{name}`", partial(spread, start=name)) for name in present),
+        line("median Chamfer distance", lambda some: f"{1e3 * median(some, 'chamfer_m'):.2f} mm"),
+        line("median F-score at 5 mm", lambda some: f"{median(some, 'fscore_5mm'):.2f}"),
+        line("another number of parts", wrong),
+        line("bodies", lambda some: str(len(some))),
     ]
-    chamfer = 1e3 * statistics.median(row["result"]["chamfer_m"] for row in rows)
-    five = statistics.median(row["result"]["fscore_5mm"] for row in rows)
     bodies = [["number", "start `levels`", "F 2 mm", "Chamfer", "parts (true)", "chosen"]]
     for row in sorted(rows, key=lambda row: str(row["name"])):
+        if row["calls"] != calls[0]:
+            continue
         result = row["result"]
         bodies.append(
             [
@@ -120,8 +142,7 @@ def _foreign_tables(rows: Sequence[Row]) -> str:
                 f"`{row['chosen']}`" + ("" if row["kept"] else ", unrefined"),
             ]
         )
-    said = f"\nMedian Chamfer distance {chamfer:.2f} mm, median F-score at 5 mm {five:.2f}. "
-    return f"\n{_table(summary)}{said}Body by body:\n\n{_table(bodies)}"
+    return f"{_table(summary)}\nBody by body, {calls[0]} calls:\n\n{_table(bodies)}"
 
 
 def _own_table(rows: Sequence[Row]) -> str:
