@@ -13,8 +13,7 @@ from pydantic import Field
 
 from sononerf.errors import InputError, SettingsError
 from sononerf.scene import MATERIALS, MaterialName, Scene, SurfaceSizeError, check_surface
-
-from .mesh_file import IN_METRES, kind_of, read_parts, stacked
+from sononerf.scene.mesh_file import IN_METRES, kind_of, read_mesh
 
 logger = logging.getLogger("sononerf")
 
@@ -36,8 +35,8 @@ def mesh(
     Args:
         path: STL, PLY, OBJ, OFF, GLB, or glTF that needs no other file; relative to the working
             directory.
-        unit: Unit of the file's numbers. GLB and glTF are in metres by their standard; the others
-            say nothing, so it must be given.
+        unit: Unit of the file's numbers. GLB and glTF are in metres by their standard, and turned
+            from y up to z up; the others say nothing, so it must be given.
         scale: Size relative to that in the file.
         centre: Move the middle of the bounding box to the origin, at which poses look.
         material: Material of the parts that ``materials`` does not name.
@@ -51,7 +50,7 @@ def mesh(
         InputError: If the file cannot be read, is damaged, or holds no surface; naming it.
         SettingsError: If ``materials`` names a part that the file has not.
     """
-    parts = read_parts(path)
+    file = read_mesh(path)
     kind = kind_of(path)
     if unit is None:
         if kind not in IN_METRES:
@@ -60,15 +59,16 @@ def mesh(
             )
         unit = "m"
     for name in materials or ():
-        if name not in parts:
-            near = difflib.get_close_matches(name, parts, n=1)
+        if name not in file.names:
+            near = difflib.get_close_matches(name, file.names, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
             raise SettingsError(
                 f"scene.options.materials: {path} has no part {name!r}; {hint}there are: "
-                f"{', '.join(parts)}"
+                f"{', '.join(file.names)}"
             )
-    vertices, faces, part = stacked(list(parts.values()))
-    vertices *= METRES[unit] * scale
+    if file.fault:
+        logger.warning("%s: %s", path, file.fault)
+    vertices, faces = METRES[unit] * scale * file.vertices, file.faces
     try:
         # Before vertices are merged: that would drop those that are no numbers without a word.
         check_surface(trimesh.Trimesh(vertices, faces, process=False, validate=False))
@@ -96,5 +96,5 @@ def mesh(
     surface = trimesh.Trimesh(vertices, faces)
     if not materials:
         return Scene(surface, MATERIALS[material], to_original=to_original)
-    chosen = tuple(MATERIALS[materials.get(name, material)] for name in parts)
-    return Scene(surface, chosen, part, to_original=to_original)
+    chosen = tuple(MATERIALS[materials.get(name, material)] for name in file.names)
+    return Scene(surface, chosen, file.part, to_original=to_original)

@@ -33,7 +33,8 @@ from sononerf.geometry.poses import KEYS, Frame
 from sononerf.head.call import attached
 from sononerf.head.head import Head
 from sononerf.run.simulate import head_of
-from sononerf.scene.scene import Scene, load_scene
+from sononerf.scene import mesh_file
+from sononerf.scene.scene import Scene, check_surface, load_scene
 from sononerf.settings.loading import faults_of, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.settings.sections import LENGTHS
@@ -185,10 +186,7 @@ def locked(runs: Iterable[Run], output: Path) -> Iterator[None]:
 
 logger = logging.getLogger("sononerf")
 
-MOST_BYTES = 2_000_000_000
-"""Largest file that is read, bytes."""
 Unit = Literal["m", "cm", "mm"]
-KINDS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
 def true_scene(settings: Settings) -> Scene | None:
@@ -218,24 +216,14 @@ def true_mesh(
 
 def read_truth(path: Path, unit: Unit = "m") -> trimesh.Trimesh:
     """Read a true surface from a file; return it in metres."""
-    if path.suffix.lower() not in KINDS:
-        raise InputError(f"{path}: evaluation.truth: expected one of {', '.join(KINDS)}")
-    if not path.is_file():
-        raise InputError(f"{path}: evaluation.truth: no such file")
-    if path.stat().st_size > MOST_BYTES:
-        raise InputError(f"{path}: evaluation.truth: larger than {MOST_BYTES} bytes")
     try:
-        mesh = trimesh.load_mesh(path)
-        if isinstance(mesh, trimesh.Scene):
-            mesh = mesh.to_mesh()
-        good = isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0
-        good = good and mesh.vertices.shape[1:] == (3,) and bool(np.isfinite(mesh.vertices).all())
-    except Exception as error:  # the error of a damaged file depends on trimesh's reader
-        raise InputError(f"{path}: evaluation.truth: damaged ({error})") from error
-    if not good:
-        raise InputError(f"{path}: evaluation.truth: holds no surface of finite triangles")
-    mesh.apply_scale(LENGTHS[unit])
-    return mesh
+        file = mesh_file.read_mesh(path)
+        mesh = trimesh.Trimesh(LENGTHS[unit] * file.vertices, file.faces, process=False)
+        check_surface(mesh)  # before vertices are merged, which drops those that are no numbers
+        mesh.merge_vertices()
+        return Scene(mesh).mesh  # warns of its faults
+    except InputError as error:
+        raise InputError(f"evaluation.truth: {error}") from None
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from sononerf.geometry.lattice import Volume
 from sononerf.geometry.meshes import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.numerics import Bools, Floats
+from sononerf.scene.gltf import Z_UP
 from sononerf.start.network import StartMethod
 
 MeshFormat = Literal["ply", "stl", "glb"]
@@ -49,7 +50,7 @@ def mesh_bytes(
     bright yellow, heard by a hundred or more, in steps even to the eye over the logarithm (see
     :func:`~sononerf.start.surface.confidence_colours`). PLY also holds the numbers
     themselves, as the vertices' property ``poses``, their error (m) as the property ``error``, and
-    always their normals. STL knows none of them.
+    always their normals. STL knows none of them. In GLB y is up, as its standard says.
 
     In: confidence (V,), error ((V,), m).
     """
@@ -65,6 +66,8 @@ def mesh_bytes(
         _carry(bare, file_type, np.asarray(confidence))
     if error is not None and file_type == "ply":
         bare.vertex_attributes["error"] = np.asarray(error, dtype=np.float32)
+    if file_type == "glb":
+        bare.vertices = bare.vertices @ Z_UP
     options = {"vertex_normal": True} if file_type == "ply" else {}
     return bytes(bare.export(file_type=file_type, **options))
 

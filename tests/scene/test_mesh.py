@@ -20,6 +20,9 @@ def load(path, **options):
     return load_scene("mesh", {"path": str(path), **options}).mesh
 
 
+Y_UP = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+
+
 def whole_gltf(shape):
     """Return a glTF that carries its numbers itself."""
     return export_gltf(trimesh.Scene(shape), embed_buffers=True)["model.gltf"]
@@ -43,7 +46,9 @@ def test_formats_and_units(tmp_path, name):
     moved = BOX.copy()
     moved.apply_translation([5.0, 6.0, 7.0])
     if kind == "gltf":
-        path.write_bytes(whole_gltf(moved))
+        path.write_bytes(whole_gltf(moved.apply_transform(Y_UP)))
+    elif kind == "glb":
+        moved.apply_transform(Y_UP).export(path)
     else:
         moved.export(path, file_type=kind)
     mesh = load(path, unit="mm")
@@ -77,7 +82,7 @@ def test_glb_and_gltf_are_in_metres(tmp_path):
     BOX.export(tmp_path / "a.glb")
     (tmp_path / "a.gltf").write_bytes(whole_gltf(BOX))
     for name in ("a.glb", "a.gltf"):
-        np.testing.assert_allclose(load(tmp_path / name).extents, [30, 20, 10])
+        np.testing.assert_allclose(load(tmp_path / name).extents, [30, 10, 20])
 
 
 def test_the_scale_multiplies_the_units(tmp_path):
@@ -92,6 +97,8 @@ def test_the_scale_multiplies_the_units(tmp_path):
 @pytest.mark.parametrize("name", ["a.glb", "a.gltf", "a.obj"])
 def test_parts_stand_in_their_places_with_their_materials(tmp_path, insect, name):
     path = tmp_path / name
+    if name != "a.obj":
+        insect.apply_transform(Y_UP)
     if name == "a.gltf":
         path.write_bytes(whole_gltf(insect))
     else:
@@ -110,7 +117,7 @@ def test_parts_stand_in_their_places_with_their_materials(tmp_path, insect, name
 def test_a_part_that_stands_twice_and_mirrored_is_one(tmp_path, insect):
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     insect.graph.update("other", matrix=mirror @ BESIDE, geometry="head")
-    insect.export(tmp_path / "a.glb")
+    insect.apply_transform(Y_UP).export(tmp_path / "a.glb")
     options = {"path": str(tmp_path / "a.glb"), "unit": "mm"}
     scene = load_scene("mesh", {**options, "materials": {"head": "leaf"}})
     assert scene.mesh.extents == pytest.approx([0.09, 0.02, 0.01])
