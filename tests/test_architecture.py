@@ -17,7 +17,7 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "numerics", "progress", "resources"),
-    ("storage", "matlab_files", "display", "settings", "geometry"),
+    ("storage", "matlab_files", "wav_files", "display", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),

@@ -38,7 +38,8 @@ from sononerf.run.build import read_mesh, read_truth
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings, read_yaml
 from sononerf.settings.sections import ImportSettings
-from sononerf.storage import commit_text, lock, read_json, read_wav, require_regular
+from sononerf.storage import commit_text, lock, read_json, require_regular
+from sononerf.wav_files import read_wav
 from tests.matlab_writer import write_new
 
 CANARY = "canary"
@@ -243,7 +244,7 @@ def wav(path, *, stated=200, order="<", long=None, rate=8000):
 
 def test_a_wav_file_holds_what_it_states(tmp_path):
     for order in "<>":
-        assert read_wav(wav(tmp_path / "whole.wav", order=order))[1].shape == (100,)
+        assert read_wav(wav(tmp_path / "whole.wav", order=order)).samples.shape == (100, 1)
         short = wav(tmp_path / "short.wav", order=order, stated=202)
         refused(read_wav, short, match="states 202 bytes of samples and holds 200")
     long = wav(tmp_path / "long.wav", stated=0xFFFFFFFF, long=9_000_000_000)
@@ -333,21 +334,13 @@ NAN = STL[:96] + np.float32(np.nan).tobytes() + STL[100:]
         ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0"),
         ("index.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
         ("points.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\n", "points.obj"),
-        (
-            "flat.obj",
-            b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
-            "line 1: a vertex has 2 coordinates",
-        ),
+        ("flat.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1: a vertex has 2 coordinates"),
         ("cut.off", OFF[:-4].encode(), "promises 12 faces, 11 can be read"),
         ("short.off", "".join(OFF.splitlines(True)[:9]).encode(), "damaged OFF|cannot be read"),
         ("corner.off", OFF.replace("3 ", "2 ").encode(), "promises 12 faces, 0"),
         ("none.off", b"OFF\n", "does not say how many"),
         ("page.off", b"<html>OFF 1 2 3", "does not begin with OFF"),
-        (
-            "far.off",
-            f"{OFF.strip()[:-1]}99".encode(),
-            "face 12 names a vertex that is none",
-        ),
+        ("far.off", f"{OFF.strip()[:-1]}99".encode(), "face 12 names a vertex that is none"),
         ("cut.gltf", GLTF[:-20], "cannot be read as GLTF"),
         ("short.gltf", re.sub(rb"base64,.{40}", b"base64,", GLTF), "short.gltf"),
         ("other.gltf", ELSEWHERE, "in another file, 'gltf_buffer_0.bin'; save it as GLB"),

@@ -21,7 +21,7 @@ from sononerf.errors import InputError
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION
 from sononerf.numerics import Bools, Floats
 from sononerf.settings.schema import FILE_SECTIONS, CallSettings, EarSettings
-from sononerf.storage import read_wav
+from sononerf.wav_files import read_wav
 
 MIN_HARMONIC = 0.25
 """Height of a harmonic, over that of the loudest one, from which it counts. Fainter echoes are not
@@ -309,10 +309,11 @@ def _load(path: Path, changed: int, size: int) -> CallFile:
     del changed
     if size > MOST_BYTES:
         raise InputError(f"{path}: {size:,} bytes; cut one call out, of {MAX_DURATION:g} s at most")
-    rate, samples = read_wav(path)
-    if samples.ndim != 1:
+    wav = read_wav(path)
+    rate, samples = wav.true_rate or wav.rate, wav.samples[:, 0]
+    if wav.samples.shape[1] != 1:
         raise InputError(
-            f"{path}: {samples.shape[1]} channels, expected 1; write out the channel of the call"
+            f"{path}: {wav.samples.shape[1]} channels, expected 1; write out that of the call"
         )
     if len(samples) > MAX_DURATION * rate:
         raise InputError(

@@ -332,10 +332,14 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
     """Read one file of any kind: its sampling rate (Hz) and samples (E, S)."""
     suffix = path.suffix.lower()
     if suffix in AUDIO:
-        rate, samples = read_audio(path)
-        wanted = settings.sampling_rate
-        # Recorders of ultrasound often write a tenth of their rate, so that it can be heard.
-        return (rate if wanted is None else wanted), samples
+        wav = read_audio(path)
+        if settings.sampling_rate is None and wav.true_rate is not None:
+            raise InputError(
+                f"{path}: its header states {wav.rate} Hz, its metadata a time expansion and a "
+                f"recorder of {wav.true_rate} Hz; set import.sampling_rate={wav.true_rate}, or "
+                f"{wav.rate} if the header is right"
+            )
+        return float(settings.sampling_rate or wav.rate), wav.samples.T
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: unknown kind of file; known: {', '.join(SOUNDS)}")
     rate, samples = waveform_of(path, read_arrays(path), settings)

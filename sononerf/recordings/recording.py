@@ -24,14 +24,14 @@ from sononerf.head.call import inverse_filter
 from sononerf.numerics import Bools, Floats, Ints
 from sononerf.recordings.pose_tables import Columns
 from sononerf.settings.sections import Channels
-from sononerf.storage import read_wav
+from sononerf.wav_files import Wav, read_wav
 
 WAV, OTHERS = (".wav",), (".flac", ".ogg", ".aiff", ".aif", ".w64", ".caf")
 AUDIO = (*WAV, *OTHERS)
 
 
-def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
-    """Read a sound file. Out: sampling_rate (Hz), samples (E, S)."""
+def read_audio(path: Path) -> Wav:
+    """Read a sound file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     stamp = path.stat()
@@ -39,18 +39,16 @@ def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
 
 
 @lru_cache(maxsize=2)  # one long file holds many pings
-def _read(path: Path, *stamp: int) -> tuple[float, NDArray[Any]]:
+def _read(path: Path, *stamp: int) -> Wav:
     """Read a file as it was at a time and of a size."""
     del stamp
-    rate, samples = (read_wav if path.suffix.lower() in WAV else _other)(path)
-    if samples.ndim == 1:
-        samples = samples[:, None]
-    if samples.ndim != 2 or not samples.size:
+    wav = read_wav(path) if path.suffix.lower() in WAV else _other(path)
+    if not wav.samples.size:
         raise InputError(f"{path}: holds no samples")
-    return float(rate), samples.T
+    return wav
 
 
-def _other(path: Path) -> tuple[float, NDArray[Any]]:
+def _other(path: Path) -> Wav:
     try:
         import soundfile
     except ImportError:
@@ -64,7 +62,7 @@ def _other(path: Path) -> tuple[float, NDArray[Any]]:
             samples = file.read(dtype=bits.get(file.subtype, "float64"), always_2d=True)
             if len(samples) != file.frames:
                 raise InputError(f"{path}: truncated, {len(samples)} of {file.frames} samples")
-            return file.samplerate, samples
+            return Wav(file.samplerate, samples)
     except (soundfile.SoundFileError, RuntimeError) as error:
         said = " ".join(str(error).split())
         raise InputError(f"{path}: cannot be read as sound ({said})") from None

@@ -140,8 +140,12 @@ def plan_import(
     limits, power = range_limits(
         head_of(settings), cutter, recording, data.get("spectrogram", {}), progress
     )
-    if not power.any():
-        raise NumericalError(f"{recording.path}: all recordings are silent; check the channels")
+    channels = channels_of(power, head.point_echo.looks)
+    if not any(channel.heard for channel in channels):
+        raise NumericalError(
+            f"{recording.path}: all recordings are silent or noise, no ping holds an echo; check "
+            "the channels, the range limits, and what the files hold"
+        )
     plain = settings.plain()
     plain["spectrogram"] |= limits
     settings = validate_settings(plain, settings.source or "import")
@@ -171,7 +175,7 @@ def plan_import(
         poses=poses,
         split=split,
         clipped=clipped,
-        channels=channels_of(power, head.point_echo.looks),
+        channels=channels,
         lengths=(min(there), max(there)),
         calibration=calibration,
         notes=recording.notes,

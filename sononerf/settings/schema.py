@@ -196,7 +196,11 @@ class SpectrogramSettings(Section):
         if self.frequency_min >= self.frequency_max:
             raise ValueError("frequency_min must lie below frequency_max")
         if self.frequency_max > self.sampling_rate / 2:
-            raise ValueError("frequency_max must not exceed half the sampling_rate")
+            raise ValueError(
+                f"frequency_max is {self.frequency_max:g} Hz and must not exceed half the "
+                f"sampling_rate of {self.sampling_rate:g} Hz; of recordings that were expanded in "
+                "time, set the recorder's own rate (import.sampling_rate)"
+            )
         if self.range_min >= self.range_max:
             raise ValueError("range_min must lie below range_max")
         wavelength = SPEED / self.frequency_max

@@ -34,24 +34,24 @@ def test_numbers_of_all_types_mean_the_same(tmp_path, tone, dtype, accuracy):
     whole = {"int16": 2.0**15, "int32": 2.0**31, "float32": 1.0, "uint8": 128.0}[dtype]
     numbers = tone * whole + (128.0 if dtype == "uint8" else 0.0)
     wavfile.write(path, RATE, numbers.T.astype(dtype))
-    rate, samples = read_audio(path)
-    assert (rate, samples.shape) == (RATE, (2, 400))
-    np.testing.assert_allclose(as_float(samples), tone, atol=accuracy)
+    wav = read_audio(path)
+    assert (wav.rate, wav.samples.shape) == (RATE, (400, 2))
+    np.testing.assert_allclose(as_float(wav.samples.T), tone, atol=accuracy)
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [(".wav", "PCM_24"), (".flac", "PCM_16")])
 def test_24_bits_and_flac(tmp_path, tone, suffix, kind):
     path = tmp_path / f"a{suffix}"
     soundfile.write(path, tone.T, RATE, subtype=kind)
-    rate, samples = read_audio(path)
-    assert (rate, samples.dtype.kind) == (RATE, "i")
-    np.testing.assert_allclose(as_float(samples), tone, atol=4e-5)
+    wav = read_audio(path)
+    assert (wav.rate, wav.samples.dtype.kind) == (RATE, "i")
+    np.testing.assert_allclose(as_float(wav.samples.T), tone, atol=4e-5)
 
 
 def test_one_channel_has_a_channel_axis(tmp_path, tone):
     path = tmp_path / "a.wav"
     wavfile.write(path, RATE, tone[0].astype("float32"))
-    assert read_audio(path)[1].shape == (1, 400)
+    assert read_audio(path).samples.shape == (400, 1)
 
 
 def test_a_folder_comes_back(tmp_path):
