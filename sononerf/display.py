@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,11 @@ def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    separator = max(",;\t", key=text.partition("\n")[0].count)
+    # Lines that programs put before the header; line numbers stay those of the file.
+    before = re.match(r'(?:(?:sep=|#).*\n)+(?=["A-Za-z])', text)
+    if before:
+        text = before[0].count("\n") * "\n" + text[before.end() :]
+    separator = max(",;\t", key=text.lstrip().partition("\n")[0].count)
     try:
         reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
         rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]

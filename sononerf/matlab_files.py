@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -149,11 +150,28 @@ def opened(path: Path) -> Iterator[h5py.File]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with h5py.File(path, "r") as file:
+        with _readable(path) as file:
             yield file
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged, truncated, or no HDF5 file ({said})") from None
+
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""What the system says of a disk that knows no locks."""
+
+
+def _readable(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except BlockingIOError:
+        raise InputError(
+            f"{path}: another process has it open for writing; close it there, or copy the file"
+        ) from None
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        return h5py.File(path, "r", locking=False)
 
 
 def child(group: Any, name: str) -> Any:

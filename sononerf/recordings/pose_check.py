@@ -32,7 +32,7 @@ from sononerf.geometry.poses import Poses, off_axis
 from sononerf.numerics import Floats, Ints
 from sononerf.recordings.pose_tables import EULER, PLACE, QUATERNION, Columns, to_poses
 from sononerf.recordings.ranges import RangePrediction, predict_ranges
-from sononerf.settings.sections import ImportSettings
+from sononerf.settings.sections import LENGTHS, ImportSettings
 
 MIN_PINGS = 12
 """Number of pings below which nothing can be tested."""
@@ -111,11 +111,24 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
         readings["quaternion order"] = to_poses(
             _with(columns, {**columns.values, **parts}), settings
         )
+    if settings.look_at is None:
+        for what in ("rotations", "poses"):
+            inverse = None if settings.inverse == what else what
+            readings[f"inverse {what}"] = to_poses(
+                columns, settings.model_copy(update={"inverse": inverse})
+            )
     for order in ("yxz", "zyx", "xzy", "yzx", "zxy"):
         places = {name: columns.values[old] for name, old in zip(PLACE, order, strict=True)}
         readings[f"swapped axes, {order} for xyz"] = to_poses(
             _with(columns, {**columns.values, **places}), settings
         )
+    stated_unit = columns.units.get(PLACE[0], "m")
+    for unit in LENGTHS:
+        if unit != stated_unit:
+            factor = LENGTHS[unit] / LENGTHS[stated_unit]
+            readings[f"{unit} for {stated_unit}"] = to_poses(
+                _scaled(columns, PLACE, factor), settings
+            )
     for axis in PLACE:
         readings[f"sign of {axis}"] = to_poses(_scaled(columns, (axis,), -1.0), settings)
     return _different(stated, readings)
@@ -189,13 +202,27 @@ def check_poses(
     head = Consistency(emitter, receivers, resolution)
     own = head.misfit(stated[sampled], ranges)
     scaled = _scaled_ranges(head, stated[sampled], ranges, own)
+    misfits = {
+        name: head.misfit(poses[sampled], ranges)
+        for name, poses in others.items()
+        if not _is_unit(name)
+        or _disproportion(poses[sampled], ranges) < _disproportion(stated[sampled], ranges)
+    }
+    gains = {name: own.total - one.total for name, one in misfits.items()}
+    enough = max(MIN_GAIN, MIN_GAIN_PER_PING * len(sampled))
     late = _late(stated[sampled], own.prediction, resolution)
     if late.name:
+        # A wrong unit makes them too long as well.
+        fit = {
+            name: gain
+            for name, gain in gains.items()
+            if _is_unit(name) and gain > enough
+            if not _late(others[name][sampled], misfits[name].prediction, resolution).name
+        }
+        best = max(fit, key=fit.__getitem__, default="")
+        if fit and fit[best] > scaled.gain:
+            return Verdict(best, _message([best]), fit[best])
         return scaled if scaled.name else late
-    gains = {
-        name: own.total - head.misfit(poses[sampled], ranges).total
-        for name, poses in others.items()
-    }
     for one, other in combinations(range(min(ranges.shape[1], MOST_CHANNELS)), 2):
         swapped = np.arange(ranges.shape[1])
         swapped[[one, other]] = other, one
@@ -204,7 +231,6 @@ def check_poses(
         found = head.misfit(stated[sampled], ranges[:, swapped])
         gains[name] = EQUAL_GAIN * (own.total - found.total)
     best = max(gains, key=gains.__getitem__, default="")
-    enough = max(MIN_GAIN, MIN_GAIN_PER_PING * len(sampled))
     order = _order(head, stated[sampled], ranges, own)
     better = order.gain + max(gains.get(best, 0.0), 0.0)
     if order.name and better < MIN_ORDER_GAIN * len(sampled):
@@ -319,11 +345,20 @@ def _scale(error: Floats, floor: float) -> float:
     return float(np.hypot(1.48 * np.median(np.abs(error)), floor))
 
 
+def _spread(poses: Poses) -> float:
+    """Return the root mean square distance of poses from their mean, m."""
+    away = poses.positions - poses.positions.mean(axis=0)
+    return float(np.sqrt(np.square(away).sum(axis=1).mean()))
+
+
+def _disproportion(poses: Poses, ranges: Floats) -> float:
+    """Return the ratio of the spread of poses and their usual range, either way, in nepers."""
+    return abs(math.log(max(_spread(poses), 1e-12) / float(np.nanmedian(ranges))))
+
+
 def _unit(poses: Poses, ranges: Floats) -> Verdict:
     """Compare how far poses lie apart with how far their echoes come from."""
-    spread = float(
-        np.sqrt(np.square(poses.positions - poses.positions.mean(axis=0)).sum(axis=1).mean())
-    )
+    spread = _spread(poses)
     usual_range = float(np.nanmedian(ranges))
     said = (
         f"poses lie {_length(spread)} from their mean, and their first echoes come from "
@@ -373,7 +408,13 @@ def _turns(poses: Poses) -> bool:
     return bool(np.abs(across @ axis - offset).max() < 0.02 * radius.mean() > 10 * radius.std())
 
 
+def _is_unit(name: str) -> bool:
+    return name.split(" for ")[0] in LENGTHS
+
+
 HINTS = {
+    "inverse rotations": "the rotations lead from the world to the head (import.inverse=rotations)",
+    "inverse poses": "rotations and places lead from the world to the head (import.inverse=poses)",
     "quaternion order": "the quaternion's scalar is its last number (columns qx, qy, qz, qw)",
     "the row after": "each ping belongs to the pose one row later; pings and poses are off by one",
     "the row before": "each ping belongs to the pose one row earlier; pings and poses are off "
@@ -397,6 +438,12 @@ def _hint(name: str) -> str:
     if name.startswith("swapped axes"):
         order = name.removeprefix("swapped axes, ")[:3]
         return "x, y and z stand in the columns {}, {} and {}".format(*order)
+    if _is_unit(name):
+        unit, _, stated = name.partition(" for ")
+        return (
+            f"the lengths are in {unit}, not in {stated}: they are "
+            f"{LENGTHS[unit] / LENGTHS[stated]:.3g} times as long (x_{unit}, or import.length)"
+        )
     if name.startswith("channels"):
         return f"{name} (import.channels, ears.receivers)"
     if name.startswith("sign of"):

@@ -202,8 +202,15 @@ def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
         hint = "; set import.turntable.radius" if columns.has("angle") else ""
         raise InputError(f"{columns.where}: column {missing[0]} is missing{hint}")
     world, head = frame_matrices(settings)
-    positions = np.stack([columns.values[name] for name in PLACE], axis=1) @ world.T
+    positions = np.stack([columns.values[name] for name in PLACE], axis=1)
     own = _rotations(columns, settings, world, head)
+    if settings.inverse is not None:
+        if own is None:
+            raise SettingsError("import.inverse: the table has no rotations; leave it out")
+        own = own.transpose(0, 2, 1)
+        if settings.inverse == "poses":
+            positions = -np.einsum("pij,pj->pi", own, positions)
+    positions = positions @ world.T
     if own is not None:
         return Poses(positions, world @ own @ head.T)
     if settings.look_at is None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Callable, Collection
 from functools import lru_cache
 from pathlib import Path
@@ -45,6 +46,12 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
         return {name: values for name, values in arrays_read.items() if values is not None}
     try:
         with path.open("rb") as file:
+            if file.read(7) == b"MATLAB ":
+                raise InputError(
+                    f"{path}: is a MATLAB file; save it as HDF5 (h5create, h5write) with pings "
+                    "along the last dimension, or see the formats sonotracelab and sononerf-matlab"
+                )
+            file.seek(0)
             arrays_read = np.load(file, allow_pickle=False)
             if isinstance(arrays_read, np.ndarray):
                 raise InputError(f"{path}: one array only; save arrays by name with numpy.savez")
@@ -440,7 +447,7 @@ def _files(
         empty = [row for row, name in enumerate(columns.texts["file"]) if not name]
         if empty:
             raise InputError(f"{columns.where}: column file of row {empty[0] + 1} is empty")
-        return [folder / name for name in columns.texts["file"]]
+        return [_spelled(folder, name) for name in columns.texts["file"]]
     if settings.file is not None:
         return [folder / settings.file] * len(columns)
     sounds = _sounds(folder, apart)
@@ -450,6 +457,13 @@ def _files(
         f"{columns.where}: no column file, and {len(sounds)} recordings in {folder}; name each "
         "ping's file in a column file, or the long one in import.file"
     )
+
+
+def _spelled(folder: Path, name: str) -> Path:
+    """Return the file of a name in the disk's own spelling of accents and slashes."""
+    forms = [name, name.replace("\\", "/")]
+    forms += [unicodedata.normalize(form, forms[1]) for form in ("NFC", "NFD")]
+    return next((folder / form for form in forms if (folder / form).is_file()), folder / name)
 
 
 def _sounds(folder: Path, apart: Collection[Path]) -> list[Path]:
@@ -485,8 +499,11 @@ def _present(
     way_out = "correct the table, or set import.missing=skip"
     lost = [path for path in dict.fromkeys(files) if not path.is_file()]
     if lost:
+        near = [path.name for place in {lost[0].parent} & {folder} for path in place.iterdir()]
+        near = [name for name in near if name.casefold() == lost[0].name.casefold()]
+        hint = f" ({near[0]} is there)" if near else ""
         raise InputError(
-            f"{columns.where}: {len(lost)} poses have no recording, such as {lost[0].name}; "
+            f"{columns.where}: {len(lost)} poses have no recording, such as {lost[0].name}{hint}; "
             f"{way_out}"
         )
     used = {path.resolve() for path in files}

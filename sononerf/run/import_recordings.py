@@ -299,6 +299,8 @@ def import_hash(plan: ImportPlan) -> str:
     # Newer keys that do not apply leave the hash as older versions made it.
     if plan.head.plane is None:
         del sections["support"]
+    if given["inverse"] is None:
+        del given["inverse"]
     if given["turntable"] is not None and given["turntable"]["surface"] is None:
         del given["turntable"]["surface"]
     digest.update(json.dumps([given, sections, plan.calibration], sort_keys=True).encode())

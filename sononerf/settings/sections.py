@@ -195,7 +195,7 @@ Channels = Annotated[
     tuple[Annotated[int, Field(ge=0)] | tuple[Annotated[int, Field(ge=0)], ...], ...],
     Field(min_length=1, max_length=256),
 ]
-LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Units of length by name, m."""
 SPLIT_SEED = 0
 
@@ -237,13 +237,15 @@ class ImportSettings(Section):
 
     # Poses.
     poses: Path = Path("poses.csv")
-    length: Literal["m", "cm", "mm"] | None = None
+    length: Literal["m", "cm", "mm", "in", "ft"] | None = None
     angle: Literal["deg", "rad"] | None = None
     frame: Literal["enu", "ned", "camera", "own"] = "enu"
     axes: Matrix | None = None
     head_axes: Matrix | None = None
     positive_pitch: Literal["down", "up"] | None = None
     quaternion: Literal["wxyz", "xyzw"] | None = None
+    # What leads from the world to the head: the rotations alone, or all of the poses
+    inverse: Literal["rotations", "poses"] | None = None
     look_at: Vector | None = None
     turntable: TurntableSettings | None = None
     # Recordings.

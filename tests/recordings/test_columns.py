@@ -60,7 +60,7 @@ def test_settings_say_units_of_plain_names(table, separator):
     [
         ("x,y,z\n1,2,3\n", "column x has no unit; name it x_m or set import.length"),
         ("x_m,y_m,z_m,yaw\n1,2,3,4\n", "column yaw has no unit; name it yaw_deg"),
-        ("x_ft\n1\n", "unknown unit 'ft'"),
+        ("x_yd\n1\n", "unknown unit 'yd'"),
         ("x_m,heigth\n1,2\n", "did you mean height?"),
         ("x_m,x_m\n1,2\n", "duplicate column"),
         ("x_m,x_mm\n1,2\n", "duplicate column"),

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import unicodedata
+
 import h5py
 import numpy as np
 import pytest
 from scipy.io import wavfile
 
 from sononerf.errors import InputError
-from sononerf.recordings.readers import read_folder
+from sononerf.recordings.readers import read_arrays, read_folder
 from sononerf.recordings.recording import Cutter
 from sononerf.settings.sections import ImportSettings
 
@@ -113,6 +117,50 @@ def test_what_has_no_partner_is_refused_or_skipped(folder):
     (folder / "1.wav").write_bytes((folder / "0.wav").read_bytes())
     with pytest.raises(InputError, match=r"1 recordings have no pose, such as 7\.wav"):
         read_folder(folder, PLAIN)
+
+
+def test_names_are_found_in_other_spellings_and_a_near_one_is_told(folder):
+    (folder / "1.wav").rename(folder / unicodedata.normalize("NFD", "é 1.wav"))
+    (folder / "sub").mkdir()
+    (folder / "2.wav").rename(folder / "sub" / "2.wav")
+    names = ["0.wav", unicodedata.normalize("NFC", "é 1.wav"), r"sub\2.wav"]
+    write(folder, ["file,x_m,y_m,z_m", *(f"{name},1,0,0" for name in names)])
+    np.testing.assert_allclose(read_folder(folder, PLAIN).read(2), 0.2)
+    (folder / "0.wav").rename(folder / "0.WAV")
+    with pytest.raises(InputError, match=r"such as 0\.wav \(0\.WAV is there\)"):
+        read_folder(folder, PLAIN)
+
+
+def test_lines_before_the_header_are_left(folder):
+    lines = (folder / "poses.csv").read_text().splitlines()
+    for before in (["sep=,"], ["# made by hand", "# in June"]):
+        write(folder, [*before, *lines])
+        assert len(read_folder(folder, PLAIN)) == 3
+    write(folder, ["sep=,", *lines, "1.wav,x,0,0"])
+    with pytest.raises(InputError, match=r"poses\.csv:6: column x_m is 'x'"):
+        read_folder(folder, PLAIN)
+
+
+def test_hdf5_that_another_process_writes_is_told(folder):
+    path = folder / "1.h5"
+    with h5py.File(path, "w") as file:
+        file["waveform"] = np.zeros((2, 60))
+    code = f"import h5py; file = h5py.File({str(path)!r}, 'a'); print('open', flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "open\n"
+        with pytest.raises(InputError, match="another process has it open"):
+            read_arrays(path)
+        other.communicate("\n")
+    assert set(read_arrays(path)) == {"waveform"}
+
+
+def test_a_matlab_file_is_called_one(folder):
+    (folder / "a.npz").write_bytes(b"MATLAB 7.3 MAT-file".ljust(600))
+    with pytest.raises(InputError, match=r"a\.npz: is a MATLAB file; save it as HDF5"):
+        read_arrays(folder / "a.npz")
 
 
 def test_what_differs_or_is_missing_is_told(folder):

@@ -15,7 +15,7 @@ from sononerf.recordings.pose_check import alternatives, check_poses, mirrored, 
 from sononerf.recordings.pose_tables import Columns, to_poses
 from sononerf.recordings.ranges import predict_ranges
 from sononerf.recordings.recording import Recording, channels_of, check_channels, faults_of_channels
-from sononerf.settings.sections import ImportSettings
+from sononerf.settings.sections import LENGTHS, ImportSettings
 from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
 
 RESOLUTION = 0.0058  # m, of the default analysis
@@ -100,6 +100,36 @@ def test_distortions_are_named(fault, seed):
     assert found.name == expected
     assert found.message
     assert "\n" not in found.message
+
+
+@pytest.mark.parametrize("seed", few(range(6), 2))
+@pytest.mark.parametrize("what", ["rotations", "poses"])
+def test_rotations_from_world_to_head_are_named_and_the_setting_mends_them(seed, what):
+    rng = np.random.default_rng(500 + seed)
+    poses = poses_of(rng, KINDS[seed % 3])
+    first = first_echoes(rng, poses, body(rng))
+    rotation, places = poses.rotations.transpose(0, 2, 1), poses.positions
+    if what == "poses":
+        places = -np.einsum("pij,pj->pi", rotation, places)
+    columns = Columns("t", dict(zip("xyz", places.T, strict=True)), {}, rotation, {"x": "m"})
+    assert f"import.inverse={what}" in verdict(columns, first).message
+    mended = ImportSettings(inverse=what)
+    np.testing.assert_allclose(to_poses(columns, mended).positions, poses.positions, atol=1e-12)
+    assert verdict(columns, first, settings=mended).message == ""
+
+
+@pytest.mark.parametrize("seed", few(range(6), 3))
+@pytest.mark.parametrize("units", ["in for cm", "cm for mm", "ft for m", "mm for cm"])
+def test_lengths_of_another_unit_are_named(seed, units):
+    true, stated = units.split(" for ")
+    rng = np.random.default_rng(600 + seed)
+    # Poses at one distance that lie too far apart fit a large body.
+    far = LENGTHS[true] < LENGTHS[stated]
+    poses = poses_of(rng, "volume" if far or seed % 2 else "sphere")
+    first = first_echoes(rng, poses, body(rng))
+    columns = scaled(table(poses), "xyz", LENGTHS[stated] / LENGTHS[true])
+    columns = Columns("t", columns.values, {}, None, {**columns.units, "x": stated})
+    assert f"in {true}, not in {stated}" in verdict(columns, first).message
 
 
 @pytest.mark.parametrize("seed", few(range(12), 3))
