@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import os
+import stat
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import ParamSpec, TypeAlias, TypeVar
 
 import numba
@@ -17,6 +21,19 @@ Bools: TypeAlias = NDArray[np.bool_]
 Complexes: TypeAlias = NDArray[np.complex128]
 
 
+def _keep_machine_code_apart() -> None:
+    """Keep it in the folder for temporary files where there is no home: numba takes ``./~``."""
+    home = os.path.expanduser("~")  # noqa: PTH111  # pathlib raises where there is none
+    if home != "~" or numba.config.CACHE_DIR:
+        return
+    folder = Path(tempfile.gettempdir()) / f"numba-{os.geteuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    status = folder.lstat()
+    if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) == 0o700:  # nobody else's
+        numba.config.CACHE_DIR = str(folder)
+
+
+_keep_machine_code_apart()
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 

@@ -191,7 +191,7 @@ def _answers(
     waiting, running = iter(list(tasks.items())), dict[Future[Any], int]()
     while True:
         while len(running) < QUEUED * count and (task := next(waiting, None)):
-            with _without_script():
+            with without_script():
                 running[executor.submit(_call, function, held, *task[1])] = task[0]
         if not running:
             return
@@ -268,6 +268,11 @@ def process_context() -> BaseContext:
     return context
 
 
+def may_start_processes() -> bool:
+    """Return False in a worker of ``multiprocessing.Pool``, which may not start any."""
+    return not multiprocessing.current_process().daemon
+
+
 def begin() -> None:
     """Let that server import while this process goes on."""
     process_context()
@@ -279,7 +284,7 @@ _STARTING = threading.RLock()
 
 
 @contextmanager
-def _without_script() -> Iterator[None]:
+def without_script() -> Iterator[None]:
     """Start workers that do not run the script that starts them: it need not be written for it."""
     with _STARTING:
         script = vars(sys.modules["__main__"])

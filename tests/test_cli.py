@@ -823,3 +823,13 @@ def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alo
     done(*arguments)
     assert steps == list(range(stopped + 1, 201))
     assert json.loads((clean / "run" / "metrics.json").read_text())["cost"]["steps"] == 200
+
+
+def test_an_argument_that_is_no_utf_8_is_refused_at_once(tmp_path):
+    name = os.fsencode(tmp_path) + b"/run\xe9"
+    command = [sys.executable, "-m", "sononerf.cli", "simulate", "sphere", "--output", name]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "holds bytes that are no UTF-8" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 """Processes that die, that cannot make what they are sent, and that a script starts."""
 
 import importlib
+import multiprocessing
 import os
 import re
 import signal
@@ -16,7 +17,14 @@ import sononerf
 from sononerf import progress
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.progress import Progress
-from sononerf.resources import TaskError, available_memory, computed, require_disk, require_memory
+from sononerf.resources import (
+    TaskError,
+    available_memory,
+    computed,
+    may_start_processes,
+    require_disk,
+    require_memory,
+)
 
 TASKS = {number: (number,) for number in range(6)}
 
@@ -236,3 +244,32 @@ def test_a_compiled_function_calls_compiled_ones_of_its_own_file_alone(name):
         for called in function.py_func.__code__.co_names:
             value = own.get(called)
             assert value is None or value.py_func.__module__ == name, called
+
+
+def test_a_worker_of_a_pool_computes_alone():
+    assert may_start_processes()
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert not pool.apply(may_start_processes)
+
+
+def test_machine_code_is_kept_apart_where_there_is_no_home(tmp_path):
+    """A user without a home and a name: the system leaves the tilde as it is."""
+    code = (
+        "import os, numba; os.path.expanduser = lambda path: path\n"
+        "import sononerf.numerics; print(numba.config.CACHE_DIR)"
+    )
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    folder = tmp_path / f"numba-{os.geteuid()}"
+    assert done.stdout.strip() == str(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)  # somebody else's, as far as one can know
+    again = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert again.stdout.strip() in ("", "None")

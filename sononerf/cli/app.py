@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import json
 import logging
+import sys
 import tempfile
 import traceback
 from pathlib import Path
@@ -110,6 +111,14 @@ def complete() -> typer.Typer:
 
 def run() -> int:
     """Run the given command and return its exit code; its exceptions pass through."""
+    for word in sys.argv[1:]:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise SettingsError(
+                f"{word!a}: holds bytes that are no UTF-8; rename the file or folder, or work "
+                "within it by a relative path"
+            ) from None
     with memory_faults():
         return complete()(prog_name="sononerf", standalone_mode=False) or 0
 

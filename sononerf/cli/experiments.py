@@ -256,10 +256,8 @@ def reconstruct(
     method: Annotated[
         SurfaceMethod | None,
         typer.Option(
-            help="levels: by a network from the echoes alone. open, filled, hull, sheet: from "
-            "field and first echoes; open opens hollows and gaps, filled leaves them closed, hull "
-            "takes the first echoes alone, sheet is for a thin sheet. isosurface: where the field "
-            "has one value. auto: the best of the first five, refined."
+            help="levels: by a network from the echoes alone, refined. isosurface: where the field "
+            "has one value."
         ),
     ] = None,
     refine: Annotated[bool | None, typer.Option(help="Refine; by default levels alone.")] = None,

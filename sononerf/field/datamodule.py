@@ -17,6 +17,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import InputError, SettingsError
 from sononerf.head.front_end import ACTIVE_DB
+from sononerf.resources import may_start_processes, without_script
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import DataSettings, FitSettings
 
@@ -110,9 +111,8 @@ class SliceStream(Dataset[RangeSlices]):
         self.share = share
         self._order: tuple[int, Tensor] = (-1, torch.zeros(0, dtype=torch.long))
 
-    @property
-    def batches_per_pass(self) -> int:
-        """Steps in which every pose or slice is met once."""
+    def __len__(self) -> int:
+        """Steps in which every pose or slice is met once; the batches go on after them."""
         return -(-self.items // self.batch)
 
     def _used_slices(self, silent_share: float, silent_below: float, seed: int) -> Tensor:
@@ -125,7 +125,7 @@ class SliceStream(Dataset[RangeSlices]):
         return torch.cat((sounding, rest[drawn])).sort().values
 
     def _items_of(self, step: int) -> Tensor:
-        turn, part = divmod(step, self.batches_per_pass)
+        turn, part = divmod(step, len(self))
         if self._order[0] != turn:
             generator = torch.Generator().manual_seed(seed_of(self.seed, 1, turn))
             self._order = (turn, torch.randperm(self.items, generator=generator))
@@ -235,6 +235,11 @@ class EpochSampler(DistributedSampler[int]):
 class EpochLoader(DataLoader[RangeSlices]):
     """Loads the batches of an :class:`EpochSampler`, which needs no state to resume."""
 
+    def __iter__(self) -> Any:
+        """Start the workers; they do not run the script of the user again."""
+        with without_script():
+            return super().__iter__()
+
     def state_dict(self) -> dict[str, Any]:
         """Return no state. With this method Lightning knows that it can resume within an epoch."""
         return {}
@@ -308,7 +313,7 @@ class EchoDataModule(lightning.LightningDataModule):
 
     def _epoch_of(self, stream: SliceStream) -> int:
         wanted = self.options.steps_per_epoch
-        steps = max(stream.batches_per_pass, LEAST_STEPS) if wanted == "auto" else wanted
+        steps = max(len(stream), LEAST_STEPS) if wanted == "auto" else wanted
         most = -1 if self.trainer is None else self.trainer.max_steps
         return steps if most < 0 else min(steps, max(most, 1))
 
@@ -359,15 +364,16 @@ class EchoDataModule(lightning.LightningDataModule):
             return 0 if trainer is None else trainer.global_step * trainer.accumulate_grad_batches
 
         stream = self.stream()
+        workers = self.workers if may_start_processes() else 0
         return EpochLoader(
             stream,
             batch_size=None,
             sampler=EpochSampler(self._epoch_of(stream), done),
             generator=torch.Generator(),
-            num_workers=self.workers,
+            num_workers=workers,
             # A forked child may hang on the store's threads.
-            multiprocessing_context="spawn" if self.workers else None,
-            persistent_workers=self.workers > 0,
+            multiprocessing_context="spawn" if workers else None,
+            persistent_workers=workers > 0,
         )
 
     def val_dataloader(self) -> DataLoader[RangeSlices] | list[DataLoader[RangeSlices]]:

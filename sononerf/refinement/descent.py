@@ -295,7 +295,7 @@ def planned(
     """Return the start and the schedule of each candidate."""
     pairs: list[tuple[StartMethod, Schedule]] = []
     for name in starts:
-        if not flat and name in ("fuller", "given"):
+        if not flat and name in ("fuller", "isosurface", "given"):
             pairs.append((name, "blurred"))
         pairs.append((name, "sharp"))
     return [("levels", "planes"), *pairs] if flat else pairs

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ import trimesh
 from lightning import Fabric
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import InputError, SettingsError, expect
+from sononerf.errors import InputError, NumericalError, SettingsError, expect
 from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.field.read_out import energy_volume, read_isosurface
@@ -67,31 +67,47 @@ def reconstruct(
             raise SettingsError(
                 "method isosurface needs a fitted model; give one, or take the method levels"
             )
-        return _of_echoes(model, progress, None)
+        return _of_echoes(model, progress)
     expect(model, EchoModule, "model")
     keywords: dict[str, Any] = {"spacing": chosen.spacing, "directions": chosen.directions}
-    with _shown(progress) as shown:
-        if chosen.method == "isosurface":
-            mesh, volume, level = read_isosurface(
-                model.field,
-                level=chosen.level,
-                smoothing=chosen.smoothing,
-                progress=shown,
-                **keywords,
+
+    def of_field() -> tuple[trimesh.Trimesh, Volume, float]:
+        with _shown(progress) as shown:
+            smoothing = chosen.smoothing
+            return read_isosurface(
+                model.field, level=chosen.level, smoothing=smoothing, progress=shown, **keywords
             )
-            return Surface(mesh, volume, "isosurface", level=level, echoes=echoes)
-        if echoes is None:
-            raise InputError("echoes: missing; give the echoes that the model was fitted to")
+
+    if chosen.method == "isosurface":
+        mesh, volume, level = of_field()
+        return Surface(mesh, volume, "isosurface", level=level, echoes=echoes)
+    if echoes is None:
+        raise InputError("echoes: missing; give the echoes that the model was fitted to")
+    with _shown(progress) as shown:
         volume = energy_volume(model.field, **keywords, progress=shown)
-    return _of_echoes(echoes, progress, volume)
+    return _of_echoes(echoes, progress, volume, lambda: of_field()[0])
 
 
-def _of_echoes(echoes: Echoes, progress: Progress, volume: Volume | None) -> Surface:
-    """Return the surface that the network makes of echoes."""
+def _of_echoes(
+    echoes: Echoes,
+    progress: Progress,
+    volume: Volume | None = None,
+    of_field: Callable[[], trimesh.Trimesh] | None = None,
+) -> Surface:
+    """Return the surface that the network makes of echoes.
+
+    Where the echoes are unlike those of its training, a level of the field is a start as well.
+    """
     starts = start_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
     mesh = starts["levels"]
-    if doubt := beyond_training(echoes.levels, echoes.bounds.mean(axis=0)):
-        progress.say(doubt)
+    middle, support = echoes.bounds.mean(axis=0), echoes.hull.plane is not None
+    if doubt := beyond_training(echoes.levels, middle, support=support):
+        if of_field is None:
+            progress.say(f"{doubt}; its surface is taken all the same, and is a guess")
+        else:
+            progress.say(f"{doubt}; a level of the field is refined beside its surface")
+            with suppress(NumericalError):
+                starts["isosurface"] = of_field()
     with _one_thread():
         heard = poses_that_hear(mesh, echoes, Optics(echoes.head))
     surface = surface_as_heard(
@@ -183,9 +199,9 @@ def refine(
 
 def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
     """Return the start surfaces of a refinement, m, by their method."""
-    if surface.method == "isosurface":
+    if surface.method == "isosurface" and not surface.starts:
         raise SettingsError(
-            "an iso-surface is not refined; reconstruct with the method auto, or give "
+            "an iso-surface is not refined; reconstruct with the method levels, or give "
             "Surface(mesh) to refine its mesh"
         )
     return dict(surface.starts) or {"given": surface.mesh}

@@ -55,6 +55,7 @@ POSE_KEYS = (
     "turntable",
 )
 """Settings of an import that say how a table of poses is to be read."""
+PROVENANCE_NAME = "provenance.json"
 RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "zarr")
 
 
@@ -144,6 +145,44 @@ def with_attached(settings: Settings, folder: Path) -> Settings:
     """Return the settings with the paths of copies in a folder, where there are copies."""
     found = attached(settings, folder)
     return settings.model_copy(update=found) if found else settings
+
+
+def located(settings: Settings, run: Path) -> Settings:
+    """Return the settings with the paths of files that are there, whatever the working folder is.
+
+    Paths that are not there from the working folder are tried from those above the run, and from
+    the one of the fit.
+    """
+    file = run / PROVENANCE_NAME
+    facts = storage.read_json(file) if file.is_file() else {}
+    above = str(facts.get("working_folder", "")) if isinstance(facts, dict) else ""
+    bases = [*run.absolute().parents, run.absolute() / above]
+
+    def there(path: Path) -> Path:
+        return (
+            path if path.exists() else next((b / path for b in bases if (b / path).exists()), path)
+        )
+
+    def within(options: Any) -> Any:
+        if isinstance(options, list):
+            return [within(one) for one in options]
+        if not isinstance(options, dict):
+            return options
+        return {
+            key: str(there(Path(one))) if key == "path" and isinstance(one, str) else within(one)
+            for key, one in options.items()
+        }
+
+    data, evaluation, scene = settings.data, settings.evaluation, settings.scene
+    changed: dict[str, Any] = {}
+    if data.store is not None:
+        changed["data"] = data.model_copy(update={"store": there(data.store)})
+    if evaluation.truth is not None:
+        truth = there(evaluation.truth)
+        changed["evaluation"] = evaluation.model_copy(update={"truth": truth})
+    if scene is not None:
+        changed["scene"] = scene.model_copy(update={"options": within(scene.options)})
+    return settings.model_copy(update=changed)
 
 
 def module_for(
@@ -258,7 +297,7 @@ def read_model(path: Path) -> Model:
             f"{path / DESCRIPTION_NAME}: reference is {reference}, expected a finite number above "
             "0; fetch the run again, or repeat the fit with --overwrite"
         )
-    settings = with_attached(settings, path)
+    settings = located(with_attached(settings, path), path)
     head = head_of(settings)
     hull = replace(hull, plane=head.plane)
     module = module_for(settings, head, region, reference)

@@ -28,7 +28,7 @@ from sononerf.report.mip_picture import mip_pictures
 from sononerf.report.page import NONE, Page, run_rows
 from sononerf.report.scene_picture import scene_png
 from sononerf.report.spectrogram_picture import spectrogram_picture
-from sononerf.run.build import flat, true_mesh
+from sononerf.run.build import PROVENANCE_NAME, flat, true_mesh
 from sononerf.run.export import read_volume
 from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml
@@ -335,7 +335,7 @@ def _command(name: str, run: Path, rest: str = "") -> str:
 
 
 def _provenance(page: Page, path: Path) -> None:
-    file = path / "provenance.json"
+    file = path / PROVENANCE_NAME
     if file.is_file():
         page.heading("Made with")
         with damage_named(file):

@@ -17,6 +17,7 @@ from its last stage. The formulas are in ``docs/method.md``.
 from __future__ import annotations
 
 import html
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -160,7 +161,7 @@ class Run(NotebookRepr):
     @property
     def provenance(self) -> dict[str, Any]:
         """Versions, machine and sources of the run; empty if the file is missing."""
-        file = self.path / "provenance.json"
+        file = self.path / build.PROVENANCE_NAME
         found = storage.read_json(file) if file.is_file() else {}
         return found if isinstance(found, dict) else {}
 
@@ -426,8 +427,14 @@ class Run(NotebookRepr):
                 storage.commit_json(self.metrics_file, metrics)
 
     def write_provenance(self, **facts: Any) -> None:
-        """Record versions and sources of the run, without names of people, machines or folders."""
-        storage.commit_json(self.path / "provenance.json", {**versions(), **facts})
+        """Record versions and sources of the run, without names of people or machines.
+
+        The working folder is recorded, from the run's on, if the run does not lie in it.
+        """
+        here, there = Path.cwd().resolve(), self.path.resolve()
+        if not there.is_relative_to(here):
+            facts["working_folder"] = os.path.relpath(here, there)
+        storage.commit_json(self.path / build.PROVENANCE_NAME, {**versions(), **facts})
 
 
 def open_run(path: Path | str) -> Run:

@@ -30,7 +30,14 @@ from sononerf.head.front_end import RANGE_DB, compress, mae_db
 from sononerf.head.head import Head
 from sononerf.numerics import Floats, Singles
 from sononerf.progress import Progress, Task
-from sononerf.resources import TaskError, available_cores, computed, preload, require_memory
+from sononerf.resources import (
+    TaskError,
+    available_cores,
+    computed,
+    may_start_processes,
+    preload,
+    require_memory,
+)
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
 from sononerf.settings.sections import PoseSettings
@@ -243,7 +250,8 @@ SeedOf = Callable[[int], int]
 
 def useful_workers(poses: int, rays: int) -> int:
     """Return the number of processes that simulates the poses soonest; one means this process."""
-    return min(available_cores(), MOST_WORKERS) if poses * (rays + POSE_RAYS) >= WORTH_RAYS else 1
+    worth = poses * (rays + POSE_RAYS) >= WORTH_RAYS and may_start_processes()
+    return min(available_cores(), MOST_WORKERS) if worth else 1
 
 
 def simulated(
@@ -258,6 +266,7 @@ def simulated(
     """Yield indices and spectrograms of poses, in any order."""
     if workers is None:
         workers = useful_workers(len(indices), simulator.rays.rays)
+    workers = workers if may_start_processes() else 1
     if simulator.low is not None:
         simulator.low.prepare(poses.positions[indices], poses.rotations[indices])
     tasks = {i: (poses.positions[i], poses.rotations[i], seed_of(i)) for i in indices}

@@ -42,9 +42,10 @@ from sononerf.start.features import (
 )
 from sononerf.start.sheet import fit_sheet
 
-StartMethod = Literal["levels", "fuller", "sheet", "given"]
+StartMethod = Literal["levels", "fuller", "sheet", "isosurface", "given"]
 """Start of a refinement. ``levels``: the surface of the network. ``fuller``: that with gaps closed.
-``sheet``: a thin body through what the network finds. ``given``: a surface of the user's."""
+``sheet``: a thin body through what the network finds. ``isosurface``: a level of the field's
+volume. ``given``: a surface of the user's."""
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 """File of the trained weights, float16."""
 VOXEL = 0.25
@@ -192,15 +193,17 @@ def expected_level(distance: Singles) -> float:
     return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE_DISTANCE
 
 
-def beyond_training(levels: RangeLevels, middle: Floats) -> str:
-    """Return in what the poses are unlike those of the training; empty if in nothing.
+def beyond_training(levels: RangeLevels, middle: Floats, *, support: bool = False) -> str:
+    """Return in what the echoes are unlike those of the training; empty if in nothing.
 
     In: middle ((3,), m): Of the body.
     """
+    if support:
+        return "the body stands on a support, which the start network has never heard"
     if len(levels.poses) < FEWEST_POSES:
         return (
             f"{len(levels.poses)} training poses are fewer than the {FEWEST_POSES} that the start "
-            "network knows; its surface is taken all the same, and is a guess"
+            "network knows"
         )
     out = levels.emitters - middle
     out /= np.linalg.norm(out, axis=1, keepdims=True)
@@ -210,7 +213,7 @@ def beyond_training(levels: RangeLevels, middle: Floats) -> str:
     if widest < NARROWEST_CAP:
         return (
             f"all poses lie within {widest:.0f} degrees of one direction, where the start network "
-            f"knows {NARROWEST_CAP} and more; its surface is taken all the same, and is a guess"
+            f"knows {NARROWEST_CAP} and more"
         )
     return ""
 

@@ -27,8 +27,8 @@ from sononerf.scene.gltf import Z_UP
 from sononerf.start.network import StartMethod
 
 MeshFormat = Literal["ply", "stl", "glb"]
-Method: TypeAlias = StartMethod | Literal["isosurface"]
-"""Method of a surface: its start, or a level of the field's volume."""
+Method: TypeAlias = StartMethod
+"""Method of a surface: its start."""
 MAX_SHEET_THICKNESS = 0.7
 """Distance of the other side below which a place is thin, range resolutions. The sides of a sheet
 share one echo, so neither is known to better than a fraction of the resolution."""

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
 import itertools
+import subprocess
+import sys
 from types import SimpleNamespace
 
+import lightning
 import numpy as np
 import pytest
 import torch
@@ -138,3 +141,52 @@ def test_a_batch_goes_to_the_device_and_stays_as_it_is_on_a_cpu(store):
     assert found.transfer_batch_to_device(given, torch.device("cpu"), 0) is given
     moved = found.transfer_batch_to_device(given, torch.device("meta"), 0)
     assert {part.device.type for part in moved} == {"meta"}
+
+
+@pytest.mark.filterwarnings("ignore:You requested to overfit:UserWarning")
+def test_lightning_can_fit_the_same_few_batches_over_and_over(store, tmp_path):
+    class Sum(lightning.LightningModule):
+        def __init__(self):
+            super().__init__()
+            self.factor = torch.nn.Parameter(torch.ones(()))
+            self.met = []
+
+        def training_step(self, batch, number):
+            self.met.append(batch.pose.tolist())
+            return self.factor * batch.spectrum.sum()
+
+        def configure_optimizers(self):
+            return torch.optim.SGD(self.parameters(), lr=1e-3)
+
+    model = Sum()
+    trainer = lightning.Trainer(
+        max_epochs=2, overfit_batches=2, accelerator="cpu", logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, default_root_dir=tmp_path,
+    )  # fmt: skip
+    trainer.fit(model, train_dataloaders=module(store).train_dataloader())
+    assert trainer.global_step == 4
+    assert model.met[:2] == model.met[2:]
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from sononerf.echoes.store import EnsembleStore
+from sononerf.field.datamodule import EchoDataModule
+print("script runs", flush=True)
+heard = SimpleNamespace(store=EnsembleStore.open(Path(sys.argv[1])), reference=1.0)
+data = EchoDataModule(heard, {"batch_poses": 3}, whole_poses=True, workers=2)
+print(sum(1 for _ in data.train_dataloader()), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_script_without_a_main_guard_may_have_workers(tmp_path):
+    path = make(tmp_path / "store").path
+    (tmp_path / "script.py").write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py", path], capture_output=True, text=True, timeout=120,
+        check=True,
+    )  # fmt: skip
+    assert done.stdout.split("\n")[:2] == ["script runs", "60"]

@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.field.checkpoint_io import load_weights
 from sononerf.field.fitting import render_poses
 from sononerf.progress import Progress
+from sononerf.run.build import true_mesh
 from sononerf.run.run import Run, open_run
 from sononerf.settings.loading import validate_settings
 
@@ -132,6 +134,23 @@ def test_a_run_finds_its_store_from_another_working_folder(run, echoes, tmp_path
     monkeypatch.chdir(other)
     found = Run(Path("../home/runs/one")).echoes
     assert found.store.path.resolve() == home / "data" / "store"
+
+
+def test_a_run_that_lies_elsewhere_finds_store_and_truth(run, echoes, tmp_path, monkeypatch):
+    home = tmp_path / "home"
+    shutil.copytree(echoes, home / "data" / "store")
+    trimesh.creation.box().export(home / "true.ply")
+    plain = Run(run).settings.plain()
+    parts = {"data": {"store": "data/store"}, "evaluation": {"truth": "true.ply"}}
+    change(run, settings={**plain, **{n: {**plain[n], **part} for n, part in parts.items()}})
+    shutil.copytree(run, tmp_path / "runs" / "one")
+    there = Run(tmp_path / "runs" / "one")
+    monkeypatch.chdir(home)
+    there.write_provenance()  # as the fit does in its working folder
+    monkeypatch.chdir(tmp_path / "runs")
+    found = Run(Path("one"))
+    assert found.echoes.store.path.resolve() == home / "data" / "store"
+    assert true_mesh(found.settings).volume == pytest.approx(1.0)
 
 
 def test_a_store_of_other_echoes_does_not_hide_that_of_the_run(run, echoes, tmp_path, monkeypatch):
