@@ -100,8 +100,8 @@ def _of_echoes(
     """
     starts = start_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
     mesh = starts["levels"]
-    middle, support = echoes.bounds.mean(axis=0), echoes.hull.plane is not None
-    if doubt := beyond_training(echoes.levels, middle, support=support):
+    support = echoes.hull.plane is not None
+    if doubt := beyond_training(echoes.levels, np.asarray(mesh.bounds), support=support):
         if of_field is None:
             progress.say(f"{doubt}; its surface is taken all the same, and is a guess")
         else:

@@ -77,9 +77,9 @@ four frames raises the median F-score at 2 mm of 19 withheld bodies from 0.83 to
 from 0.59 to 0.65; eight frames give no more."""
 CHANNELS = (48, 80, 112, 144)
 """Channels of the network, from fine to coarse."""
-FEWEST_POSES, NARROWEST_CAP = 12, 53
-"""Number of poses, and half-angle of the cap that they lie on, degrees, at least in the
-training."""
+FEWEST_POSES, NARROWEST_CAP, LARGEST_BODY = 12, 53, 26
+"""Of the training: number of poses and half-angle of the cap that they lie on, degrees, at least;
+longest side of a body, range resolutions, at most."""
 _RESOLVED = 8  # voxels of the smallest part
 _ROOM = 1.0  # distance in front of the onsets that the lattice covers, steps of the search
 
@@ -193,13 +193,19 @@ def expected_level(distance: Singles) -> float:
     return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE_DISTANCE
 
 
-def beyond_training(levels: RangeLevels, middle: Floats, *, support: bool = False) -> str:
+def beyond_training(levels: RangeLevels, bounds: Floats, *, support: bool = False) -> str:
     """Return in what the echoes are unlike those of the training; empty if in nothing.
 
-    In: middle ((3,), m): Of the body.
+    In: bounds ((2, 3), m): Of the body.
     """
     if support:
         return "the body stands on a support, which the start network has never heard"
+    size, middle = float(np.ptp(bounds, axis=0).max() / levels.resolution), bounds.mean(axis=0)
+    if size > LARGEST_BODY:
+        return (
+            f"the body is {size:.0f} range resolutions large, and the start network knows "
+            f"{LARGEST_BODY} at most"
+        )
     if len(levels.poses) < FEWEST_POSES:
         return (
             f"{len(levels.poses)} training poses are fewer than the {FEWEST_POSES} that the start "

@@ -337,8 +337,11 @@ def test_hollows_are_filled_and_parts_of_few_voxels_left_out():
     ids=["all around", "few", "one place", "narrow cap", "wide cap"],
 )
 def test_poses_unlike_those_of_the_training_are_told(sources, said):
-    found = beyond_training(heard(sources)[0], np.zeros(3))
+    size = 10 * RESOLUTION * np.array([[-1.0] * 3, [1.0] * 3])
+    found = beyond_training(heard(sources)[0], size)
     assert said in found if said else found == ""
+    assert "40 range resolutions large" in beyond_training(heard(sources)[0], 2 * size)
+    assert "on a support" in beyond_training(heard(sources)[0], size, support=True)
 
 
 def test_weights_of_another_version_are_refused(tmp_path, monkeypatch):

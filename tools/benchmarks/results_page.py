@@ -21,8 +21,8 @@ BOTH = ("three_spheres", "ua")
 HEAD = """# Results
 
 Written by `python tools/benchmark.py surfaces --page`
-from runs of commit {commit} ({machine}, no GPU). Default settings, seed 0 of
-poses and fit, 400 training poses where no other number is named, and 20 held-out poses that were
+from runs of commit {commit}, where no other is named ({machine}, no GPU). Default settings, seed 0
+of poses and fit, 400 training poses where no other number is named, and 20 held-out poses that were
 drawn apart and never trained on. The echoes come from our own simulator. Decibels, active cells and
 scores are explained in the README; how long it takes is in [performance.md](performance.md).
 
@@ -66,20 +66,22 @@ def write_page(output: Path, page: Path = PAGE, readme: Path = README) -> str:
     own = [row for row in rows_of(output / "surfaces.jsonl") if "failed" not in row]
     own = [row for row in own if row["seed"] == 0]
     foreign = rows_of(output / "foreign.jsonl")
-    commits = sorted({row["commit"] for row in (*own, *foreign)})
-    if not commits:
+    if not own and not foreign:
         raise SystemExit(f"error: {output}: holds no finished rows (surfaces.jsonl, foreign.jsonl)")
-    if len(commits) > 1:
-        raise SystemExit(f"error: {output}: rows of several commits ({', '.join(commits)})")
+    usual = statistics.mode(row["commit"] for row in (*own, *foreign))
+    for row in (*own, *foreign):
+        if row["commit"] != usual:
+            row["name"] += f" (commit {row['commit']})"
     machine = (own or foreign)[0]["machine"]
-    text = HEAD.format(commit=commits[0], machine=machine)
+    text = HEAD.format(commit=usual, machine=machine)
     if foreign:
         calls = sorted({row["calls"] for row in foreign}, reverse=True)
         count = len({row["name"] for row in foreign})
         text += FOREIGN.format(count=count, calls=" ".join(map(str, calls)))
         text += _foreign_tables(foreign, calls)
     if own:
-        text += OWN.format(names=" ".join(row["name"] for row in own)) + _own_table(own)
+        names = " ".join(row["name"].partition(" ")[0] for row in own)
+        text += OWN.format(names=names) + _own_table(own)
     runs = {name: output / f"{name}-0" / "metrics.json" for name in BOTH}
     if all(file.is_file() for file in runs.values()):
         metrics = {name: json.loads(file.read_text("utf-8")) for name, file in runs.items()}
