@@ -275,8 +275,8 @@ class Candidate:
 
     @property
     def best(self) -> int:
-        """Number of the surface with the least objective: 0 for the start, from 1 on for stages."""
-        return int(np.nanargmin(self.objectives))
+        """Number of the surface with the least objective; that of the start, 0, does not count."""
+        return 1 + int(np.argmin(self.objectives[1:]))
 
     @property
     def objective(self) -> float:

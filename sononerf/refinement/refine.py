@@ -59,8 +59,6 @@ class Refined:
     confidence: Floats
     error: Floats  # (V,), m: See :mod:`sononerf.refinement.surface_error`
     start: StartMethod  # Name of the start that was refined
-    # True where the refined surface explains the validation poses better than the start
-    kept: bool
     # Objective on validation poses, see :class:`~sononerf.refinement.objective.Comparison`
     error_db: float
     # Per stage: its number, start, schedule, last mismatch, and objective after it
@@ -130,9 +128,6 @@ class Refinement:
             if candidate in self.candidates:
                 self.stage(candidate, 0)
         self.candidates = after_first_stage(self.candidates, self.comparison.misfit)
-        for candidate in self.candidates:
-            start = f"the start {candidate.start}"
-            candidate.objectives[0] = self._objective(candidate.meshes[0], start)
 
     def stage(self, candidate: Candidate, number: int) -> None:
         """Do a stage of a candidate, or take it from the saved ones."""
@@ -315,7 +310,7 @@ class Refinement:
             return None
 
     def result(self) -> Refined:
-        """Return the best surface so far; the start where all refined ones are clearly worse."""
+        """Return the surface of the stage that is best so far."""
         candidate = min(self.candidates, key=lambda one: one.objective)
         best = candidate.best
         mesh = candidate.meshes[best]
@@ -330,7 +325,7 @@ class Refinement:
         )
         confidence *= deviation.heard
         values = np.stack([confidence, deviation.error], axis=1)
-        if best and candidate.schedule != "planes":
+        if candidate.schedule != "planes":
             mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(
             mesh=mesh,
@@ -338,7 +333,6 @@ class Refinement:
             confidence=values[:, 0],
             error=values[:, 1],
             start=candidate.start,
-            kept=best > 0,
             error_db=candidate.objective,
             history=self.history,
             faults=self.faults,

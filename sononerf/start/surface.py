@@ -173,7 +173,7 @@ class Surface(NotebookRepr):
         confidence ((V,) int32 or None): Number of poses that heard the surface around each vertex.
         error ((V,) float32 or None, m): Distance within which the true surface is with a
             probability of 90 %, where the confidence is above zero; None without a refinement.
-        refined: True where the refined mesh explains the validation poses better than its start.
+        refined: Whether it was refined.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
         echoes: Echoes of its field; None if unknown.
