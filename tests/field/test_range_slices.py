@@ -80,7 +80,7 @@ def test_batch_k_depends_on_seed_and_k_alone(store, whole):
     turned = stream(store, **options, seed=2)
     assert not all(same(turned[k], once[k]) for k in range(12))
     # Each pass has an order of its own, and each step its frequencies.
-    per_pass = forwards.batches_per_pass
+    per_pass = len(forwards)
     assert not torch.equal(forwards[0].pose, forwards[per_pass].pose)
     assert len({tuple(batch.bins.tolist()) for batch in once}) > 3
 
@@ -88,7 +88,7 @@ def test_batch_k_depends_on_seed_and_k_alone(store, whole):
 @KINDS
 def test_a_pass_meets_everything_once(store, whole):
     found = stream(store, whole_poses=whole, batch=1 if whole else 6)
-    per_pass = found.batches_per_pass
+    per_pass = len(found)
     assert per_pass == 7
     for turn in (0, 1):
         met = []
@@ -107,7 +107,7 @@ def test_of_silent_slices_a_share_is_met_and_of_the_others_all(store):
 
     def met(**more):
         found = stream(store, **options, **more)
-        batches = [found[step] for step in range(found.batches_per_pass)]
+        batches = [found[step] for step in range(len(found))]
         return [(int(batch.pose), int(batch.rows)) for batch in batches]
 
     assert sorted(met(silent_share=0.0)) == sorted(sounding)
