@@ -211,6 +211,8 @@ def _both(runs: Mapping[str, Mapping[str, Any]]) -> str:
             lambda m: (
                 f"{1e3 * m['geometry']['thickness_bias_m']:+.2f} mm · "
                 f"{m['geometry']['volume_ratio']:.2f}"
+                if m["geometry"]["volume_ratio"] is not None
+                else "open"
             ),
         ),
         row(
