@@ -27,8 +27,11 @@ def _keep_machine_code_apart() -> None:
     if home != "~" or numba.config.CACHE_DIR:
         return
     folder = Path(tempfile.gettempdir()) / f"numba-{os.geteuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    status = folder.lstat()
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:  # it cannot be made: the code is compiled in each process
+        return
     if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) == 0o700:  # nobody else's
         numba.config.CACHE_DIR = str(folder)
 

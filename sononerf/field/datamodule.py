@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from typing import Any, Literal, NamedTuple
 
 import lightning
@@ -237,7 +238,7 @@ class EpochLoader(DataLoader[RangeSlices]):
 
     def __iter__(self) -> Any:
         """Start the workers; they do not run the script of the user again."""
-        with without_script():
+        with without_script() if self.num_workers else nullcontext():
             return super().__iter__()
 
     def state_dict(self) -> dict[str, Any]:

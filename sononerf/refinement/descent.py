@@ -267,7 +267,7 @@ class Candidate:
     start: StartMethod  # Name of the start
     level: ErrorLevel  # Its gains and errors
     meshes: list[trimesh.Trimesh]  # The start, and the surface after each stage so far, m
-    # Objectives of these on the validation poses; NaN for a start that was not compared
+    # Objectives of these on the validation poses; NaN for the start, which is not compared
     objectives: list[float]
     # Number of its steps so far; it determines their poses, so that a candidate does not depend on
     # the others

@@ -96,7 +96,7 @@ def _of_echoes(
 ) -> Surface:
     """Return the surface that the network makes of echoes.
 
-    Where the echoes are unlike those of its training, a level of the field is a start as well.
+    Where the echoes are unlike those of its training, an iso-surface of the field is a start too.
     """
     starts = start_surfaces(echoes.levels, echoes.hull, echoes.bounds, echoes.head.resolution)
     mesh = starts["levels"]
@@ -105,7 +105,7 @@ def _of_echoes(
         if of_field is None:
             progress.say(f"{doubt}; its surface is taken all the same, and is a guess")
         else:
-            progress.say(f"{doubt}; a level of the field is refined beside its surface")
+            progress.say(f"{doubt}; an iso-surface of the field is refined beside its surface")
             with suppress(NumericalError):
                 starts["isosurface"] = of_field()
     with _one_thread():

@@ -199,17 +199,17 @@ def beyond_training(levels: RangeLevels, bounds: Floats, *, support: bool = Fals
     In: bounds ((2, 3), m): Of the body.
     """
     if support:
-        return "the body stands on a support, which the start network has never heard"
+        return "the body stands on a support, and the start network was trained without one"
     size, middle = float(np.ptp(bounds, axis=0).max() / levels.resolution), bounds.mean(axis=0)
     if size > LARGEST_BODY:
         return (
-            f"the body is {size:.0f} range resolutions large, and the start network knows "
-            f"{LARGEST_BODY} at most"
+            f"the body is {size:.0f} range resolutions large, and the start network was "
+            f"trained with {LARGEST_BODY} at most"
         )
     if len(levels.poses) < FEWEST_POSES:
         return (
-            f"{len(levels.poses)} training poses are fewer than the {FEWEST_POSES} that the start "
-            "network knows"
+            f"{len(levels.poses)} training poses are fewer than the {FEWEST_POSES} of the training "
+            "of the start network"
         )
     out = levels.emitters - middle
     out /= np.linalg.norm(out, axis=1, keepdims=True)
@@ -218,8 +218,8 @@ def beyond_training(levels: RangeLevels, bounds: Floats, *, support: bool = Fals
     widest = math.degrees(math.acos(max(-1.0, min(least, 1.0))))
     if widest < NARROWEST_CAP:
         return (
-            f"all poses lie within {widest:.0f} degrees of one direction, where the start network "
-            f"knows {NARROWEST_CAP} and more"
+            f"all poses lie within {widest:.0f} degrees of one direction, and the start network "
+            f"was trained with {NARROWEST_CAP} and more"
         )
     return ""
 

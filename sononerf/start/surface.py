@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import trimesh
@@ -27,8 +27,6 @@ from sononerf.scene.gltf import Z_UP
 from sononerf.start.network import StartMethod
 
 MeshFormat = Literal["ply", "stl", "glb"]
-Method: TypeAlias = StartMethod
-"""Method of a surface: its start."""
 MAX_SHEET_THICKNESS = 0.7
 """Distance of the other side below which a place is thin, range resolutions. The sides of a sheet
 share one echo, so neither is known to better than a fraction of the resolution."""
@@ -185,7 +183,7 @@ class Surface(NotebookRepr):
 
     mesh: trimesh.Trimesh
     volume: Volume | None = None
-    method: Method = "given"
+    method: StartMethod = "given"
     level: float | None = None
     openness: Openness | None = None
     confidence: NDArray[np.int32] | None = None
