@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.errors import InputError
-from sononerf.storage import require_regular
+from sononerf.storage import none_such, require_regular
 
 logger = logging.getLogger("sononerf")
 
@@ -35,8 +35,8 @@ class Wav:
     Attributes:
         rate (Hz): Sampling rate in the header.
         samples (S, E): As they are stored; they stay on disk, but for those of 24 bits.
-        true_rate (Hz): Sampling rate of the recorder, where metadata (GUANO) state a time
-            expansion; None elsewhere.
+        true_rate (Hz): Sampling rate of the recorder, where metadata (GUANO) state another, as of a
+            time expansion; None elsewhere.
     """
 
     rate: int
@@ -58,8 +58,8 @@ def read_wav(path: Path) -> Wav:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if content[:4].tobytes() not in FORMS or content[8:12].tobytes() != b"WAVE":
-        raise InputError(f"{path}: no WAV file, whatever its name says")
-    chunks = _chunks(content)
+        raise none_such(path, "WAV file")
+    chunks = _chunks(path, content)
     if b"data" not in chunks or chunks.get(b"fmt ", (0, 0))[1] < 16:
         name = "samples (data)" if b"fmt " in chunks else "format (fmt)"
         raise InputError(f"{path}: damaged or truncated WAV file; it holds no {name}")
@@ -73,7 +73,12 @@ def read_wav(path: Path) -> Wav:
         raise InputError(
             f"{path}: has a sampling rate of {rate} Hz and {channels} channels; write the file anew"
         )
-    width = (align or channels * -(-bits // 8)) // channels
+    width = -(-bits // 8)
+    if align not in (0, width * channels):
+        raise InputError(
+            f"{path}: its header states {channels} channels of {bits} bits, and {align} bytes for "
+            "each moment (block align); write the file anew"
+        )
     if (form, width) not in KINDS:
         raise InputError(
             f"{path}: holds samples of format {form} with {8 * width} bits, which is not read; "
@@ -94,7 +99,7 @@ def _order(content: NDArray[np.uint8]) -> Literal["<", ">"]:
     return ">" if content[:4].tobytes() == b"RIFX" else "<"
 
 
-def _chunks(content: NDArray[np.uint8]) -> dict[bytes, tuple[int, int]]:
+def _chunks(path: Path, content: NDArray[np.uint8]) -> dict[bytes, tuple[int, int]]:
     """Return where each chunk begins, and its size in bytes as the header states it."""
     chunks: dict[bytes, tuple[int, int]] = {}
     at = 12
@@ -103,6 +108,8 @@ def _chunks(content: NDArray[np.uint8]) -> dict[bytes, tuple[int, int]]:
         at += 8
         if name == b"data" and size == UNSTATED and chunks.get(b"ds64", (0, 0))[1] >= 16:
             size = int(content[chunks[b"ds64"][0] :][8:16].view("<u8")[0])
+        if name == b"data" and name in chunks:
+            raise InputError(f"{path}: holds two series of samples (data); write the file anew")
         chunks.setdefault(name, (at, size))
         at += size
         if size % 2 and at < len(content) and content[at] == 0:  # some leave the padding out
@@ -155,5 +162,5 @@ def _true_rate(
     begin, size = chunks.get(b"guan", (0, 0))
     text = content[begin : begin + min(size, 100_000)].tobytes().decode("utf-8", errors="replace")
     fields = dict(re.findall(r"(?m)^\s*(TE|Samplerate)\s*:\s*(\d+)", text))
-    true = int(fields.get("Samplerate", rate))
-    return true if int(fields.get("TE", 1)) > 1 and true != rate else None
+    true = int(fields.get("Samplerate", rate * max(int(fields.get("TE", 1)), 1)))
+    return true if true not in (0, rate) else None

@@ -100,7 +100,9 @@ def test_floats_and_other_widths_mean_the_same(tmp_path):
         ({"head": form(rate=0)}, "a sampling rate of 0 Hz"),
         ({"head": form(channels=0)}, "and 0 channels"),
         ({"head": b""}, "holds no format"),
-        ({"kind": b"FORM"}, "no WAV file"),
+        ({"kind": b"FORM"}, "no WAV file; it is AIFF"),
+        ({"after": chunk(b"data", PCM16)}, "two series of samples"),
+        ({"head": form()[:20] + b"\3\0" + form()[22:]}, "of 16 bits, and 3 bytes"),
     ],
 )
 def test_a_header_that_contradicts_the_file_is_named(tmp_path, given, words):
@@ -108,9 +110,11 @@ def test_a_header_that_contradicts_the_file_is_named(tmp_path, given, words):
         read_wav(write(tmp_path, **given))
 
 
-def test_a_time_expansion_is_named_with_the_setting_that_mends_it(tmp_path):
-    notes = chunk(b"guan", NOTES + b"TE: 10\nSamplerate: 2500000\n")
-    path = write(tmp_path, after=notes)
+@pytest.mark.parametrize(
+    "fields", [b"TE: 10\nSamplerate: 2500000\n", b"TE:10\r\n", b"Samplerate: 2500000"]
+)
+def test_a_time_expansion_is_named_with_the_setting_that_mends_it(tmp_path, fields):
+    path = write(tmp_path, after=chunk(b"guan", NOTES + fields))
     with pytest.raises(InputError, match=r"250000 Hz.*set import\.sampling_rate=2500000"):
         read_sound(path, ImportSettings())
     for rate in (2_500_000, RATE):  # both pieces of advice, followed

@@ -21,6 +21,7 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import math
 import tempfile
 import warnings
 from functools import lru_cache
@@ -32,10 +33,10 @@ from numpy.typing import NDArray
 
 from sononerf import storage
 from sononerf.errors import InputError
-from sononerf.head.directivity import MOST_RECEIVERS, Directivity, unit_vectors
+from sononerf.head.directivity import FADE, MOST_RECEIVERS, Directivity, unit_vectors
 from sononerf.matlab_files import read_mat
 from sononerf.numerics import Floats
-from sononerf.storage import require_regular
+from sononerf.storage import name_by_content, none_such, require_regular
 
 logger = logging.getLogger("sononerf")
 
@@ -44,6 +45,8 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 SIDES = ("left", "right")
 CONVENTIONS = ("SimpleFreeFieldHRIR", "SimpleFreeFieldHRTF", "GeneralTF", "FreeFieldDirectivityTF")
 METRES = ("", "m", "metre", "meter", "metres", "meters")
+HERTZ = {"": 1.0, "hz": 1.0, "hertz": 1.0, "khz": 1e3, "kilohertz": 1e3}
+"""Units of frequencies and sampling rates, Hz."""
 EMITTER = "emitter"
 """Name of the receiver that holds the gain of the emitter."""
 EMITTER_ATTRIBUTE = "GLOBAL_LastReceiver"
@@ -88,6 +91,13 @@ def _read(path: Path, content: str) -> Directivity:
             "ears.directivity=omnidirectional",
             path,
         )
+    middle = directivity.directions.mean(axis=0)
+    if (directivity.directions @ middle).min() > math.cos(FADE) * float(np.linalg.norm(middle)):
+        logger.warning(
+            "%s: the directivity is measured within %.0f degrees of one direction alone, and beside "
+            "it gains fade to zero; are the angles radians, or not of the whole head?",
+            *(path, math.degrees(FADE)),
+        )
     return directivity
 
 
@@ -98,6 +108,8 @@ def read_csv(path: Path) -> Directivity:
     (linear) or ``gain_db``, and perhaps ``receiver``: a number from 0 on, or ``emitter``. Every
     receiver has every direction at every frequency, once, in any order.
     """
+    if name_by_content(path):
+        raise none_such(path, "SOFA file, .mat file or table of gains")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -257,6 +269,7 @@ class _Sofa:
         source = self._position("SourcePosition", measurements)
         offsets = source - self._position("ListenerPosition", measurements, [[0.0, 0.0, 0.0]])
         directions = np.einsum("mij,mj->mi", self._frame("Listener", measurements), offsets)
+        self._require_one_distance(offsets)
         places = self._position("ReceiverPosition", receivers, [[0.0, 0.0, 0.0]])
         last = str(getattr(self.file, EMITTER_ATTRIBUTE, "")) == EMITTER
         emitting = [receivers - 1] if last else []
@@ -270,6 +283,19 @@ class _Sofa:
             beam=gains[:, emitting[0]] if emitting else None,
             places=places[hearing] if apart else None,  # all at one point: it does not say where
         )
+
+    def _require_one_distance(self, offsets: Floats) -> None:
+        """Refuse directions that were measured at several distances: one gain would be a mixture."""
+        distance = np.linalg.norm(offsets, axis=1)
+        _, index = np.unique(self._units(offsets).round(6), axis=0, return_inverse=True)
+        order = np.lexsort((distance, index.reshape(-1)))
+        same = np.diff(index.reshape(-1)[order]) == 0
+        apart = np.diff(distance[order]) > 0.01 * distance[order][1:]
+        if (same & apart).any():
+            raise InputError(
+                f"{self.path}: directions are measured at several distances, from "
+                f"{distance.min():.3g} to {distance.max():.3g}; keep those of one"
+            )
 
     def _transducer(self, frequency: Floats, gains: Floats) -> Directivity:
         if len(gains) != 1:
@@ -298,7 +324,7 @@ class _Sofa:
         """Return frequencies (F,) and magnitudes (M, R, F)."""
         if hasattr(self.file, "Data_IR"):
             response = self._whole("Data_IR")
-            rate = float(self._numbers("Data_SamplingRate").reshape(-1)[0])
+            rate = float(self._hertz("Data_SamplingRate")[0])
             if not 0.0 < rate < 1e9:
                 raise InputError(f"{self.path}: Data.SamplingRate is {rate:g} Hz, expected above 0")
             # Twice as long: a squared magnitude changes twice as fast as its response is long.
@@ -307,7 +333,7 @@ class _Sofa:
                 np.arange(length // 2 + 1) * (rate / length),
                 np.abs(np.fft.rfft(response, length, axis=2)),
             )
-        real, frequency = self._whole("Data_Real"), self._numbers("N").reshape(-1)
+        real, frequency = self._whole("Data_Real"), self._hertz("N")
         if hasattr(self.file, "Data_Imag"):
             imaginary = self._whole("Data_Imag")
             if real.shape != imaginary.shape:
@@ -322,6 +348,15 @@ class _Sofa:
                 f"receivers, {len(frequency)} frequencies)"
             )
         return frequency, np.abs(real)
+
+    def _hertz(self, name: str) -> Floats:
+        """Return frequencies or sampling rates (N,) in Hz."""
+        unit = str(getattr(self.file, f"{name}_Units", "")).partition(",")[0].strip().lower()
+        if unit not in HERTZ:
+            raise InputError(
+                f"{self.path}: {name.replace('_', '.')} is in {unit}, expected hertz or kilohertz"
+            )
+        return self._numbers(name).reshape(-1) * HERTZ[unit]
 
     def _whole(self, name: str) -> Floats:
         """Return data (M, R, N or F); sofar leaves trailing dimensions of one out."""
@@ -341,6 +376,11 @@ class _Sofa:
         unit = str(getattr(self.file, f"{owner}_Units", "")).partition(",")[0].strip().lower()
         if kind == "spherical":
             angles = values[:, :2] if unit.startswith("rad") else np.radians(values[:, :2])
+            if np.abs(angles[:, 1]).max() > math.pi / 2.0 + 1e-3:
+                raise InputError(
+                    f"{self.path}: {name} has an elevation of "
+                    f"{math.degrees(np.abs(angles[:, 1]).max()):.4g} degrees, expected -90 to 90"
+                )
             if unit.startswith("rad"):
                 logger.warning("%s: %s is in radians, and is read so", self.path, name)
             values = values[:, 2:] * unit_vectors(*angles.T)

@@ -248,6 +248,15 @@ def analysed_ears(
 
     Out: lag ((E, F, L, A) float32 or None, s).
     """
+    measured = _measured(settings)
+    if measured is not None and len(measured.frequency) > 1:
+        lowest, highest = measured.frequency[[0, -1]]
+        if highest < spectrogram.frequency_min or lowest > spectrogram.frequency_max:
+            raise InputError(
+                f"{measured.source}: is measured from {lowest:.4g} to {highest:.4g} Hz, and the "
+                f"spectrograms have {spectrogram.frequency_min:.4g} to "
+                f"{spectrogram.frequency_max:.4g} Hz; check the unit of its frequencies"
+            )
     return _analysed(settings, call, spectrogram, directivity_content(settings))
 
 

@@ -27,10 +27,19 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sononerf.geometry.poses import Poses, off_axis
 from sononerf.numerics import Floats, Ints
-from sononerf.recordings.pose_tables import EULER, PLACE, QUATERNION, Columns, to_poses
+from sononerf.recordings.pose_tables import (
+    EULER,
+    PLACE,
+    QUATERNION,
+    Columns,
+    frame_matrices,
+    has_rotations,
+    to_poses,
+)
 from sononerf.recordings.ranges import RangePrediction, predict_ranges
 from sononerf.settings.sections import LENGTHS, ImportSettings
 
@@ -65,6 +74,11 @@ RANDOM_ORDERS = 4
 """Number of random orders that the stated order of the poses is compared with."""
 XYZW = (QUATERNION[-1], *QUATERNION[:-1])
 """Columns that hold w, x, y, z if numbers in the order x, y, z, w have the names w, x, y, z."""
+MIRROR = np.diag([1.0, -1.0, 1.0])
+AXES = "other axes of the head, "
+"""Stands in the name of a convention between what it is and the settings that mend it."""
+MOST_NAMED = 3
+"""Number of conventions, at most, that a message names."""
 AIM_FLOOR = np.radians(20.0)
 """Angle between aim and body below which all heads count as aiming equally well, rad."""
 MIN_DIRECTION_SPREAD = 0.15
@@ -106,17 +120,24 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
             values = columns.values
             swapped = {**values, "yaw": values[other], other: values["yaw"]}
             readings[f"yaw and {other} swapped"] = to_poses(_with(columns, swapped), settings)
+        heading = {**columns.values, "yaw": np.pi / 2.0 - columns.values["yaw"]}
+        readings["compass heading"] = to_poses(_with(columns, heading), settings)
+        order = "xyz" if settings.euler == "zyx" else "zyx"
+        readings[f"import.euler={order}"] = to_poses(
+            columns, settings.model_copy(update={"euler": order})
+        )
     if columns.has(*QUATERNION):
         parts = {name: columns.values[old] for name, old in zip(QUATERNION, XYZW, strict=True)}
         readings["quaternion order"] = to_poses(
             _with(columns, {**columns.values, **parts}), settings
         )
-    if settings.look_at is None:
+    if has_rotations(columns):
         for what in ("rotations", "poses"):
             inverse = None if settings.inverse == what else what
             readings[f"inverse {what}"] = to_poses(
                 columns, settings.model_copy(update={"inverse": inverse})
             )
+        readings |= _head_axes(columns, settings)
     for order in ("yxz", "zyx", "xzy", "yzx", "zxy"):
         places = {name: columns.values[old] for name, old in zip(PLACE, order, strict=True)}
         readings[f"swapped axes, {order} for xyz"] = to_poses(
@@ -148,8 +169,26 @@ def shifted(columns: Columns, pings: Ints, settings: ImportSettings) -> dict[str
 
 def mirrored(poses: Poses) -> Poses:
     """Return poses as a mirror shows them: the world's and the head's y point the other way."""
-    mirror = np.diag([1.0, -1.0, 1.0])
-    return Poses(poses.positions @ mirror, mirror @ poses.rotations @ mirror)
+    return Poses(poses.positions @ MIRROR, MIRROR @ poses.rotations @ MIRROR)
+
+
+def _head_axes(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
+    """Return the poses if a head has other axes, in a right-handed and a left-handed frame."""
+    world, head = frame_matrices(settings)
+    readings = {}
+    for turn in Rotation.create_group("O").as_matrix().round().astype(int):
+        for name, mirror in (("", np.eye(3)), ("a left-handed frame and ", MIRROR)):
+            own = {"axes": mirror @ world, "head_axes": turn @ mirror @ head}
+            rows = {key: (matrix.round(6) + 0.0).tolist() for key, matrix in own.items()}
+            advice = " ".join(f"import.{key}={matrix}" for key, matrix in rows.items())
+            advice = f"import.frame=own {advice}".replace(", ", ",").replace(".0", "")
+            # Ears do not tell well whether the head stands upright in a mirrored world.
+            ahead_and_left = (turn @ mirror)[:2, :2]
+            if not np.array_equal(ahead_and_left, np.eye(2)):
+                readings[f"{name}{AXES}{advice}"] = to_poses(
+                    columns, settings.model_copy(update={"frame": "own", **rows})
+                )
+    return readings
 
 
 def _with(columns: Columns, values: dict[str, Floats]) -> Columns:
@@ -243,7 +282,8 @@ def check_poses(
     turns = _turns(stated)
     named = [
         "reversed turntable" if turns and name == "left-handed frame" else name
-        for name in (best, *equal)
+        # A simpler convention that explains the echoes as well is named first.
+        for name in sorted((best, *equal), key=_axes_named)
     ]
     return Verdict(named[0], _message(named), gains[best])
 
@@ -415,6 +455,7 @@ def _is_unit(name: str) -> bool:
 HINTS = {
     "inverse rotations": "the rotations lead from the world to the head (import.inverse=rotations)",
     "inverse poses": "rotations and places lead from the world to the head (import.inverse=poses)",
+    "compass heading": "yaw is a compass heading, from y towards x (write 90 degrees less it)",
     "quaternion order": "the quaternion's scalar is its last number (columns qx, qy, qz, qw)",
     "the row after": "each ping belongs to the pose one row later; pings and poses are off by one",
     "the row before": "each ping belongs to the pose one row earlier; pings and poses are off "
@@ -429,9 +470,18 @@ HINTS = {
 }
 
 
+def _axes_named(name: str) -> int:
+    """Return how much is to be changed: nothing about axes, those of the head, or all."""
+    return (AXES in name) + (AXES in name and not name.startswith(AXES))
+
+
 def _message(names: list[str]) -> str:
-    hints = " or ".join(dict.fromkeys(_hint(name) for name in names))
-    return f"another convention of poses explains the first echoes better: {hints}"
+    hints = " or ".join(dict.fromkeys(_hint(name) for name in names[:MOST_NAMED]))
+    more = len(names) - MOST_NAMED
+    further = (
+        f"; {more} others explain them as well, such as other rolls of the head" if more > 0 else ""
+    )
+    return f"another convention of poses explains the first echoes better: {hints}{further}"
 
 
 def _hint(name: str) -> str:
@@ -444,6 +494,11 @@ def _hint(name: str) -> str:
             f"the lengths are in {unit}, not in {stated}: they are "
             f"{LENGTHS[unit] / LENGTHS[stated]:.3g} times as long (x_{unit}, or import.length)"
         )
+    if AXES in name:
+        what, _, advice = name.partition(AXES)
+        return f"{what}{AXES[:-2]} ({advice})"
+    if name.startswith("import.euler"):
+        return f"yaw, pitch and roll are applied in the other order ({name})"
     if name.startswith("channels"):
         return f"{name} (import.channels, ears.receivers)"
     if name.startswith("sign of"):

@@ -129,6 +129,11 @@ def _parted(where: str, full: str) -> tuple[str, str | None]:
         raise InputError(
             f"{where}: column {full}: unknown unit {unit!r}; known: {', '.join(units) or 'none'}"
         )
+    if not full or full.startswith("Unnamed"):
+        raise InputError(
+            f"{where}: a column has no name; if it is an index, as pandas writes it, leave it out "
+            "(index=False)"
+        )
     allowed = [*KINDS, *TEXTS]
     near = difflib.get_close_matches(full.lower(), allowed, n=1)
     hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(allowed)}"
@@ -224,6 +229,13 @@ def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
         raise InputError(f"{columns.where}: import.look_at: {error}") from None
 
 
+def has_rotations(columns: Columns) -> bool:
+    """Return True if the table itself states where each head looks."""
+    return columns.rotation is not None or any(
+        name in columns.values for name in (*EULER, *QUATERNION)
+    )
+
+
 def _rotations(
     columns: Columns, settings: ImportSettings, world: Floats, head: Floats
 ) -> Floats | None:
@@ -253,6 +265,8 @@ def _rotations(
     yaw, pitch, roll = parts
     if settings.positive_pitch is not None and settings.positive_pitch != _pitch(world, head):
         pitch = -pitch
+    if settings.euler == "xyz":
+        return rotation_from_euler(-yaw, -pitch, -roll).transpose(0, 2, 1)
     return rotation_from_euler(yaw, pitch, roll)
 
 

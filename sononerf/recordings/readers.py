@@ -21,6 +21,7 @@ from sononerf.numerics import Floats
 from sononerf.recordings.pose_tables import EULER, PLACE, Columns, columns_of, read_table
 from sononerf.recordings.recording import AUDIO, Recording, read_audio
 from sononerf.settings.sections import ImportSettings
+from sononerf.storage import none_such
 
 HDF5 = (".h5", ".hdf5", ".hdf")
 SUFFIXES = (".npz", *HDF5)
@@ -46,11 +47,9 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
         return {name: values for name, values in arrays_read.items() if values is not None}
     try:
         with path.open("rb") as file:
-            if file.read(7) == b"MATLAB ":
-                raise InputError(
-                    f"{path}: is a MATLAB file; save it as HDF5 (h5create, h5write) with pings "
-                    "along the last dimension, or see the formats sonotracelab and sononerf-matlab"
-                )
+            start = file.read(6)
+            if start[:2] != b"PK" and start != b"\x93NUMPY":
+                raise none_such(path, ".npz")
             file.seek(0)
             arrays_read = np.load(file, allow_pickle=False)
             if isinstance(arrays_read, np.ndarray):
@@ -342,9 +341,9 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
         wav = read_audio(path)
         if settings.sampling_rate is None and wav.true_rate is not None:
             raise InputError(
-                f"{path}: its header states {wav.rate} Hz, its metadata a time expansion and a "
-                f"recorder of {wav.true_rate} Hz; set import.sampling_rate={wav.true_rate}, or "
-                f"{wav.rate} if the header is right"
+                f"{path}: its header states {wav.rate} Hz, its metadata (GUANO) a recorder of "
+                f"{wav.true_rate} Hz, as after a time expansion; set import.sampling_rate="
+                f"{wav.true_rate}, or {wav.rate} if the header is right"
             )
         return float(settings.sampling_rate or wav.rate), wav.samples.T
     if suffix not in SUFFIXES:
@@ -474,6 +473,10 @@ def _sounds(folder: Path, apart: Collection[Path]) -> list[Path]:
     ]
 
 
+def _listed(path: Path, folder: Path) -> str:
+    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+
 def _pattern(path: Path) -> str:
     """Return a file's name with a mark in place of its numbers: pings differ in these alone."""
     return re.sub(r"\d+", "#", path.name)
@@ -499,12 +502,13 @@ def _present(
     way_out = "correct the table, or set import.missing=skip"
     lost = [path for path in dict.fromkeys(files) if not path.is_file()]
     if lost:
-        near = [path.name for place in {lost[0].parent} & {folder} for path in place.iterdir()]
-        near = [name for name in near if name.casefold() == lost[0].name.casefold()]
-        hint = f" ({near[0]} is there)" if near else ""
+        near = [path.name for path in folder.iterdir()]
+        own_name = re.split(r"[\\/]", lost[0].name)[-1].casefold()
+        near = [name for name in near if name.casefold() == own_name]
+        hint = f" ({near[0]} is in {folder})" if near else ""
         raise InputError(
-            f"{columns.where}: {len(lost)} poses have no recording, such as {lost[0].name}{hint}; "
-            f"{way_out}"
+            f"{columns.where}: {len(lost)} poses have no recording, such as "
+            f"{_listed(lost[0], folder)}{hint}; {way_out}"
         )
     used = {path.resolve() for path in files}
     folders = {path.parent for path in files}

@@ -7,6 +7,7 @@ whole ones, or end the process on the bytes of a stranger.
 
 from __future__ import annotations
 
+import codecs
 import re
 import stat
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from sononerf.errors import InputError
 from sononerf.numerics import Floats, Ints
 from sononerf.scene.gltf import read_gltf, strip_triangles
+from sononerf.storage import name_by_content, none_such
 
 LARGEST_FILE = 1_000_000_000  # bytes
 LARGEST_MESH = 20_000_000  # triangles
@@ -91,9 +93,11 @@ def read_mesh(path: Path | str) -> MeshFile:
     data = _read(Path(path))
     try:
         stated = READERS[kind](data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     except Exception as error:  # whatever the bytes of a stranger lead to
+        if name_by_content(Path(path)):
+            raise none_such(Path(path), f"{kind.upper()} file") from None
+        if isinstance(error, InputError):
+            raise InputError(f"{path}: {error}") from None
         text = " ".join(str(error).split())[:200]
         raise InputError(
             f"{path}: cannot be read as {kind.upper()} ({type(error).__name__}: {text})"
@@ -185,7 +189,8 @@ def _numbers(words: Sequence[str], line: int) -> list[float]:
 
 
 def _text(data: bytes) -> str:
-    return data.decode("utf-8-sig", errors="replace")
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
 
 def _read_obj(data: bytes) -> Polygons:
@@ -232,6 +237,11 @@ def _read_off(data: bytes) -> Polygons:
         for number, line in enumerate(_LINE.split(_text(data)), start=1)
         if (words := line.partition("#")[0].split())
     ]
+    if lines and re.match(r"\w*(4|n)\w*OFF|\w*OFF BINARY", " ".join(lines[0][1])):
+        raise InputError(
+            f"OFF of the kind {' '.join(lines[0][1][:2])[:20]!r}, which is not read; save it as "
+            "text with three coordinates"
+        )
     word = re.fullmatch(r"(?:ST)?C?N?OFF(\d*)|()\d+", lines[0][1][0]) if lines else None
     if not word:
         raise InputError("no OFF file; it does not begin with OFF")
@@ -295,7 +305,7 @@ def _read_text_stl(text: str) -> Polygons:
         facets = len(re.findall(r"\bfacet\s+normal\b", solid[2], re.I))
         ends = len(re.findall(r"\bend\s*facet\b", solid[2], re.I))
         if not len(corners) == 3 * facets == 3 * ends:
-            raise InputError("text STL that breaks off; save it again")
+            raise InputError("text STL that breaks off, or a facet without three corners")
         for corner in corners:
             try:
                 vertices.append([float(word) for word in corner.groups()])
@@ -309,24 +319,10 @@ def _read_text_stl(text: str) -> Polygons:
     return Polygons(vertices, np.full(count, 3), np.arange(3 * count), part, tuple(names))
 
 
-PLY_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float": "f4",
-    "double": "f8",
-    "float32": "f4",
-    "float64": "f8",
-}
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_OLD = "char uchar short ushort int uint float double".split()
+_NEW = "int8 uint8 int16 uint16 int32 uint32 float32 float64".split()
+PLY_TYPES = dict(zip((*_OLD, *_NEW), 2 * _CODES, strict=True))
 PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -365,6 +361,10 @@ def _read_ply(data: bytes) -> Polygons:
     for name, count, properties in elements:
         columns[name], at = _ply_rows(body, at, name, count, properties)
     places = columns.get("vertex", {})
+    if not {"x", "y", "z"} <= set(places):
+        raise InputError(
+            f"PLY whose vertices have no x, y and z but {', '.join(places) or 'nothing'}"
+        )
     vertices = np.column_stack([places[axis][1] for axis in "xyz"])
     if strips := columns.get("tristrips", {}).get("vertex_indices"):
         corners = np.concatenate(

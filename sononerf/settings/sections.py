@@ -243,6 +243,8 @@ class ImportSettings(Section):
     axes: Matrix | None = None
     head_axes: Matrix | None = None
     positive_pitch: Literal["down", "up"] | None = None
+    # Order of the matrices of yaw (z), pitch (y) and roll (x)
+    euler: Literal["zyx", "xyz"] = "zyx"
     quaternion: Literal["wxyz", "xyzw"] | None = None
     # What leads from the world to the head: the rotations alone, or all of the poses
     inverse: Literal["rotations", "poses"] | None = None

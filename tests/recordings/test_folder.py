@@ -127,7 +127,7 @@ def test_names_are_found_in_other_spellings_and_a_near_one_is_told(folder):
     write(folder, ["file,x_m,y_m,z_m", *(f"{name},1,0,0" for name in names)])
     np.testing.assert_allclose(read_folder(folder, PLAIN).read(2), 0.2)
     (folder / "0.wav").rename(folder / "0.WAV")
-    with pytest.raises(InputError, match=r"such as 0\.wav \(0\.WAV is there\)"):
+    with pytest.raises(InputError, match=r"such as 0\.wav \(0\.WAV is in "):
         read_folder(folder, PLAIN)
 
 
@@ -159,7 +159,7 @@ def test_hdf5_that_another_process_writes_is_told(folder):
 
 def test_a_matlab_file_is_called_one(folder):
     (folder / "a.npz").write_bytes(b"MATLAB 7.3 MAT-file".ljust(600))
-    with pytest.raises(InputError, match=r"a\.npz: is a MATLAB file; save it as HDF5"):
+    with pytest.raises(InputError, match=r"a\.npz: no \.npz; it is a MATLAB file; save it as HDF5"):
         read_arrays(folder / "a.npz")
 
 

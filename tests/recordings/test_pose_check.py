@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
@@ -116,6 +118,60 @@ def test_rotations_from_world_to_head_are_named_and_the_setting_mends_them(seed,
     mended = ImportSettings(inverse=what)
     np.testing.assert_allclose(to_poses(columns, mended).positions, poses.positions, atol=1e-12)
     assert verdict(columns, first, settings=mended).message == ""
+
+
+CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+"""Axes of a camera of OpenGL (x right, y up, z back) in the head's."""
+
+
+@pytest.mark.parametrize("seed", few(range(6), 2))
+@pytest.mark.parametrize("kind", ["right-handed", "left-handed"])
+def test_other_axes_of_the_head_are_named_and_the_settings_mend_them(seed, kind):
+    rng = np.random.default_rng(700 + seed)
+    true = poses_of(rng, KINDS[seed % 3])
+    first = first_echoes(rng, true, body(rng))
+    poses = true if kind == "right-handed" else mirrored(true)
+    rotation = poses.rotations @ CAMERA.T
+    columns = Columns(
+        "t", dict(zip("xyz", poses.positions.T, strict=True)), {}, rotation, {"x": "m"}
+    )
+    message = verdict(columns, first).message
+    advised = [
+        ImportSettings.model_validate({"frame": "own", "axes": axes, "head_axes": head_axes})
+        for axes, head_axes in re.findall(r"import.axes=(\S+) import.head_axes=([^\s)]+)", message)
+        for axes, head_axes in [(json.loads(axes), json.loads(head_axes))]
+    ]
+    # Ears in one plane do not tell up from down, and so no mirrored world from a true one.
+    mended = [to_poses(columns, settings) for settings in advised]
+    assert any(np.allclose(one.rotations, true.rotations, atol=1e-5) for one in mended)
+    assert verdict(columns, first, settings=advised[0]).message == ""
+
+
+@pytest.mark.parametrize("seed", few(range(6), 2))
+def test_angles_in_the_other_order_are_named_and_the_setting_mends_them(seed):
+    rng = np.random.default_rng(800 + seed)
+    poses = poses_of(rng, KINDS[seed % 3])
+    first = first_echoes(rng, poses, body(rng))
+    roll, pitch, yaw = Rotation.from_matrix(poses.rotations).as_euler("XYZ").T
+    columns = table(poses)
+    columns = Columns(
+        "t", columns.values | {"yaw": yaw, "pitch": pitch, "roll": roll}, {}, None, columns.units
+    )
+    assert "import.euler=xyz" in verdict(columns, first).message
+    mended = ImportSettings(euler="xyz")
+    np.testing.assert_allclose(to_poses(columns, mended).rotations, poses.rotations, atol=1e-12)
+    assert verdict(columns, first, settings=mended).message == ""
+
+
+@pytest.mark.parametrize("seed", few(range(6), 2))
+def test_a_compass_heading_is_named(seed):
+    rng = np.random.default_rng(900 + seed)
+    poses = poses_of(rng, KINDS[seed % 3])
+    first = first_echoes(rng, poses, body(rng))
+    columns = table(poses)
+    values = {**columns.values, "yaw": np.pi / 2.0 - columns.values["yaw"]}
+    columns = Columns("t", values, {}, None, columns.units)
+    assert verdict(columns, first).name == "compass heading"
 
 
 @pytest.mark.parametrize("seed", few(range(6), 3))

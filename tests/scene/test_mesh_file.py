@@ -104,6 +104,10 @@ def test_an_index_of_obj_counts_back_from_its_own_line(tmp_path, kind, parts):
         ("a.obj", OBJ.replace("f 4 3", "f -9 3"), "face 1 names a vertex that is none of its 8"),
         ("a.stl", STL.replace("vertex 20 20 0", "vertex 20 20,5 0"), "line .*'20,5' is no number"),
         ("a.stl", STL[:-20], "breaks off"),
+        ("a.stl", "version https://git-lfs.github.com/spec/v1\n", "it is a pointer of Git LFS"),
+        ("a.stl", "<!DOCTYPE html><html>solid vertex", "it is a web page"),
+        ("a.off", "4OFF\n1 1 0\n", "of the kind '4OFF'"),
+        ("a.off", "OFF BINARY\n1 1 0\n", "of the kind 'OFF BINARY'"),
         ("a.stl", STL.replace("endloop\nendfacet\nendsolid", "endsolid"), "breaks off"),
     ],
 )

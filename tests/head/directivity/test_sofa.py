@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity_files import read_sofa
+from sononerf.head.directivity_files import read_directivity, read_sofa
 from tests.head.directivity.patterns import FREQUENCY, PLACES, pair
 from tests.head.directivity.sofa_files import written
 
@@ -69,6 +69,37 @@ def test_receivers_all_at_one_point_have_no_places(tmp_path):
     assert read_sofa(path).places is None
 
 
+@pytest.mark.parametrize("unit", ["kilohertz", "kHz"])
+def test_frequencies_are_in_the_unit_that_the_file_states(tmp_path, unit):
+    path = written(tmp_path / "a.sofa", "GeneralTF", N=FREQUENCY / 1e3)
+    with h5py.File(path, "r+") as file:
+        attribute("N", "Units", unit)(file)
+    np.testing.assert_allclose(read_sofa(path).frequency, FREQUENCY)
+
+
+def test_directions_at_several_distances_are_refused(tmp_path):
+    gains = pair().gains.transpose(1, 0, 2)
+    places = pair().directions
+    path = written(
+        tmp_path / "a.sofa",
+        "GeneralTF",
+        SourcePosition=np.concatenate([places, 0.5 * places]),
+        SourcePosition_Type="cartesian",
+        SourcePosition_Units="metre",
+        Data_Real=np.concatenate([gains, 0.5 * gains]),
+        Data_Imag=np.zeros((2 * len(gains), *gains.shape[1:])),
+    )
+    with pytest.raises(InputError, match="several distances, from 0.5 to 1;"):
+        read_sofa(path)
+
+
+def test_a_table_in_radians_that_says_degrees_is_told(tmp_path, caplog):
+    x, y, z = pair().directions.T
+    angles = np.stack([np.arctan2(y, x), np.arcsin(z), np.ones(len(x))], axis=1)
+    read_directivity(written(tmp_path / "a.sofa", "GeneralTF", SourcePosition=angles))
+    assert "are the angles radians" in caplog.text
+
+
 def attribute(owner, name, value):
     def change(file):
         (file[owner] if owner else file).attrs[name] = np.bytes_(value)
@@ -99,6 +130,11 @@ def replaced(name, make):
         (attribute("ReceiverPosition", "Units", "mm"), "ReceiverPosition is in mm, expected metre"),
         (replaced("Data.Real", lambda v: v * np.nan), "the gains hold NaN"),
         (replaced("Data.Real", lambda v: v[:, :, 1:]), "Data.Real and Data.Imag differ"),
+        (attribute("N", "Units", "radian per second"), "N is in radian per second, expected hertz"),
+        (
+            replaced("SourcePosition", lambda v: np.abs([1, 1, 1] * v - [0, 90, 0])),
+            "elevation of 1[678]. degrees, expected -90 to 90",
+        ),
         (replaced("SourcePosition", lambda v: v[1:]), r"SourcePosition has the shape \(322, 3\)"),
         (replaced("SourcePosition", lambda v: 0 * v), "a position or view gives no direction"),
         (replaced("ReceiverPosition", lambda v: np.ones((3, 3))), r"expected \(2, 3\)"),
