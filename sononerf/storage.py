@@ -30,7 +30,7 @@ WAYS_OUT = {
     errno.ENOSPC: "the disk is full; free space, then give the same command again",
     errno.EDQUOT: "the quota is used up; free space, then give the same command again",
     errno.EFBIG: "the file would pass the size limit; raise it (ulimit -f)",
-    errno.EROFS: "the file system is read-only; choose another folder with --output",
+    errno.EROFS: "the file system is read-only; choose another folder (--output, data.store)",
     errno.EACCES: "permission denied; change its permissions or choose another folder",
     errno.EPERM: "not permitted; change its permissions or choose another folder",
     errno.ENOTDIR: "a part of the path is a file; choose another folder",

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from sononerf.errors import StoppedError
+from sononerf.errors import StoppedError, StorageError
 
 GOES_ON = "the same command goes on where it stopped"
 AFTERWARDS = {
@@ -49,6 +50,11 @@ def _signals_unwind(came: list[int]) -> Iterator[None]:
 
 
 def _run(came: list[int]) -> int:
+    try:
+        os.getcwd()
+    except OSError:  # libraries end the process without it
+        sys.stderr.write("error: the working folder was deleted; change to another one\n")
+        return StorageError.exit_code
     try:
         with _signals_unwind(came):
             from sononerf.cli import app

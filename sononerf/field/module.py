@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,6 +24,7 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
 from sononerf.echoes.echoes import Echoes
+from sononerf.echoes.region import EchoRegion
 from sononerf.errors import IncompatibleError, InputError, NumericalError, SettingsError, expect
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import RangeSlices, seed_of
@@ -107,6 +109,13 @@ beside other work. The figure is for lobes; for a network several threads always
 def decibels(magnitude: Tensor, reference: float | Tensor) -> Tensor:
     """Compress: 20 log10(1 + m / m0), in dB; zero for silence."""
     return 20.0 * torch.log10(1.0 + magnitude / reference)
+
+
+def _possible(region: EchoRegion, places: Tensor, tolerance: float) -> Tensor:
+    left = region.possible(places.cpu().double().numpy(), tolerance)
+    if not left.any():
+        left[:] = True  # the user's own box is kept whole
+    return torch.as_tensor(left, device=places.device)
 
 
 class EchoModule(lightning.LightningModule):
@@ -231,14 +240,6 @@ class EchoModule(lightning.LightningModule):
         if region is None:
             own = field.region if isinstance(field, Field) else echoes.box
             region = echoes.region.box() if own is None else own
-        found = echoes.region
-
-        def possible(places: Tensor, tolerance: float) -> Tensor:
-            left = found.possible(places.cpu().double().numpy(), tolerance)
-            if not left.any():
-                left[:] = True  # the user's own box is kept whole
-            return torch.as_tensor(left, device=places.device)
-
         made = cls(
             field,
             renderer,
@@ -248,7 +249,7 @@ class EchoModule(lightning.LightningModule):
             field_options=field_options,
             renderer_options=renderer_options,
             options=options,
-            possible=possible,
+            possible=partial(_possible, echoes.region),  # no closure: strategies pickle it
         )
         made.active_db = echoes.active_db
         return made

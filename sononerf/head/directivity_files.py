@@ -94,8 +94,8 @@ def _read(path: Path, content: str) -> Directivity:
     middle = directivity.directions.mean(axis=0)
     if (directivity.directions @ middle).min() > math.cos(FADE) * float(np.linalg.norm(middle)):
         logger.warning(
-            "%s: the directivity is measured within %.0f degrees of one direction alone, and beside "
-            "it gains fade to zero; are the angles radians, or not of the whole head?",
+            "%s: the directivity is measured within %.0f degrees of one direction alone; beside "
+            "it gains fade to zero; are the angles radians?",
             *(path, math.degrees(FADE)),
         )
     return directivity
@@ -285,7 +285,7 @@ class _Sofa:
         )
 
     def _require_one_distance(self, offsets: Floats) -> None:
-        """Refuse directions that were measured at several distances: one gain would be a mixture."""
+        """Refuse directions that were measured at several distances, whose gains differ."""
         distance = np.linalg.norm(offsets, axis=1)
         _, index = np.unique(self._units(offsets).round(6), axis=0, return_inverse=True)
         order = np.lexsort((distance, index.reshape(-1)))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import j1
 
-from sononerf.errors import SettingsError
+from sononerf.errors import InputError, SettingsError
 from sononerf.head.directivity import Directivity, unit_vectors
 from sononerf.head.directivity_files import content_hash, read_directivity
 from sononerf.head.front_end import frequency_axis, smearing

@@ -89,7 +89,7 @@ def test_directions_at_several_distances_are_refused(tmp_path):
         Data_Real=np.concatenate([gains, 0.5 * gains]),
         Data_Imag=np.zeros((2 * len(gains), *gains.shape[1:])),
     )
-    with pytest.raises(InputError, match="several distances, from 0.5 to 1;"):
+    with pytest.raises(InputError, match=r"several distances, from 0\.5 to 1;"):
         read_sofa(path)
 
 
