@@ -52,9 +52,9 @@ def read_wav(path: Path) -> Wav:
     """
     try:
         require_regular(path)
-        content = np.fromfile(path, np.uint8, 12)
-        if len(content) == 12:
-            content = np.memmap(path, np.uint8, "r")
+        content = np.zeros(12, np.uint8)
+        if path.stat().st_size >= len(content):
+            content = np.asarray(np.memmap(path, np.uint8, "r"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if content[:4].tobytes() not in FORMS or content[8:12].tobytes() != b"WAVE":

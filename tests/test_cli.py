@@ -833,3 +833,10 @@ def test_an_argument_that_is_no_utf_8_is_refused_at_once(tmp_path):
     assert "holds bytes that are no UTF-8" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_deleted_working_folder_is_one_line(tmp_path):
+    command = ["sh", "-c", f'rmdir "$PWD"; exec {sys.executable} -m sononerf.cli scenes']
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 4
+    assert done.stderr == "error: the working folder was deleted; change to another one\n"

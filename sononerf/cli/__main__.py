@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 from sononerf.errors import StoppedError, StorageError
@@ -51,7 +51,7 @@ def _signals_unwind(came: list[int]) -> Iterator[None]:
 
 def _run(came: list[int]) -> int:
     try:
-        os.getcwd()
+        Path.cwd()
     except OSError:  # libraries end the process without it
         sys.stderr.write("error: the working folder was deleted; change to another one\n")
         return StorageError.exit_code

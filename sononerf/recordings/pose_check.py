@@ -47,6 +47,8 @@ MIN_PINGS = 12
 """Number of pings below which nothing can be tested."""
 MAX_PINGS = 400
 """Number of pings, at most, that are tested, evenly over all."""
+MOST_SCREENED = 64
+"""Number of pings, evenly over all, on which a convention must be better to be tested on all."""
 MIN_GAIN_PER_PING = 0.15
 """Least gain in log-likelihood per ping for another convention to be named."""
 MIN_GAIN = 12.0
@@ -241,11 +243,14 @@ def check_poses(
     head = Consistency(emitter, receivers, resolution)
     own = head.misfit(stated[sampled], ranges)
     scaled = _scaled_ranges(head, stated[sampled], ranges, own)
+    few = np.linspace(0, len(sampled) - 1, min(MOST_SCREENED, len(sampled))).round().astype(int)
+    own_few = head.misfit(stated[sampled[few]], ranges[few]).total
     misfits = {
         name: head.misfit(poses[sampled], ranges)
         for name, poses in others.items()
         if not _is_unit(name)
         or _disproportion(poses[sampled], ranges) < _disproportion(stated[sampled], ranges)
+        if head.misfit(poses[sampled[few]], ranges[few]).total < own_few
     }
     gains = {name: own.total - one.total for name, one in misfits.items()}
     enough = max(MIN_GAIN, MIN_GAIN_PER_PING * len(sampled))

@@ -149,12 +149,23 @@ def _sphere(middle: Floats, first: Floats) -> tuple[Floats, float]:
     def misfit(unknown: Floats) -> Floats:
         return (np.linalg.norm(places - unknown[:3], axis=1) - unknown[3] - ranges) / scale
 
+    def slope(unknown: Floats) -> Floats:
+        away = places - unknown[:3]
+        length = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+        return -np.hstack([away / length, np.ones((len(away), 1))]) / scale
+
     best = None
     # Poses on one side of a body leave two sides to look on.
     for side in _sides(places, start, scale):
         guess = np.r_[side, np.linalg.norm(places - side, axis=1).mean() - np.median(ranges)]
         solution = least_squares(
-            misfit, guess, loss="soft_l1", f_scale=0.02, max_nfev=60, x_scale=max(spread, scale)
+            misfit,
+            guess,
+            slope,
+            loss="soft_l1",
+            f_scale=0.02,
+            max_nfev=60,
+            x_scale=max(spread, scale),
         )
         if best is None or solution.cost < best.cost:
             best = solution
@@ -164,7 +175,7 @@ def _sphere(middle: Floats, first: Floats) -> tuple[Floats, float]:
 
 def _sides(places: Floats, start: Floats, scale: float) -> list[Floats]:
     """Return guesses of a centre: amid the places, and beside them where they are flattest."""
-    normal = np.linalg.svd(places - start, full_matrices=True)[2][-1]
+    normal = np.linalg.eigh(np.cov((places - start).T))[1][:, 0]
     return [start, start + scale * normal, start - scale * normal]
 
 

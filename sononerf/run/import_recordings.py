@@ -299,8 +299,9 @@ def import_hash(plan: ImportPlan) -> str:
     # Newer keys that do not apply leave the hash as older versions made it.
     if plan.head.plane is None:
         del sections["support"]
-    if given["inverse"] is None:
-        del given["inverse"]
+    for name, plain_value in (("inverse", None), ("euler", "zyx")):
+        if given[name] == plain_value:
+            del given[name]
     if given["turntable"] is not None and given["turntable"]["surface"] is None:
         del given["turntable"]["surface"]
     digest.update(json.dumps([given, sections, plan.calibration], sort_keys=True).encode())

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import lightning
 import numpy as np
 import pytest
@@ -54,6 +56,13 @@ def test_a_module_is_made_again_from_its_checkpoint(echoes, tmp_path):
         assert torch.equal(again.state_dict()[name], values), name
     plain = torch.load(tmp_path / "model.ckpt", weights_only=True)["hyper_parameters"]
     assert (plain["field"], plain["options"]["seed"]) == ("grid", 3)
+
+
+def test_a_module_can_be_pickled_for_strategies_that_start_processes(echoes):
+    model = EchoModule.for_echoes(echoes, region=BOX, **SMALL)
+    again = pickle.loads(pickle.dumps(model))
+    places = torch.zeros(1, 3)
+    assert torch.equal(again.possible(places, 0.01), model.possible(places, 0.01))
 
 
 class Other(lightning.LightningModule):
