@@ -220,6 +220,12 @@ def test_frequencies_outside_of_the_file_are_the_nearest(file):
     np.testing.assert_array_equal(ears.ears[:, 3], ears.ears[:, 2])
 
 
+def test_a_file_of_another_band_than_the_spectrograms_is_refused(file):
+    high = SpectrogramSettings(sampling_rate=1e6, frequency_min=150e3, frequency_max=250e3)
+    with pytest.raises(InputError, match=r"a\.sofa: is measured from .* Hz, and the spectrograms"):
+        analysed_ears(measured(file), CallSettings(), high)
+
+
 def test_behind_the_measured_half_nothing_is_heard(file):
     ears = ear_tables(measured(file), [50e3])
     assert ear_gain(ears, 0, direction(90, 0))[0] > 0.1
