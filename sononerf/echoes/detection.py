@@ -164,13 +164,21 @@ class Levels(NamedTuple):
     total: Floats  # (..., R) threshold of noise, precursors, and echoes that the first slice cuts
 
 
-def threshold_levels(power: Floats, looks: float) -> Levels:
-    """Return the thresholds of noise, and of noise and precursors. In: power (..., R)."""
+def threshold_levels(power: Floats, looks: float, ahead: Floats | None = None) -> Levels:
+    """Return the thresholds of noise, and of noise and precursors.
+
+    In: power (..., R), ahead (L,), the least precursors: those of the call.
+    """
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
     noise = np.maximum(noise, DYNAMIC_RANGE * power.max(initial=0.0))
     total = np.broadcast_to(noise, power.shape).copy()
-    precursors = factor * _precursors(power.reshape(-1, power.shape[-1]))
+    precursors = _precursors(power.reshape(-1, power.shape[-1]))
+    if ahead is not None and len(ahead):
+        size = max(len(precursors), min(len(ahead), power.shape[-1] - 1))
+        both = [np.pad(each[:size], (0, max(size - len(each), 0))) for each in (precursors, ahead)]
+        precursors = np.maximum(*both)
+    precursors = factor * precursors
     own = precursors >= 1.0
     guard = int(own.argmin()) if not own.all() else len(own)
     behind = precursors[guard:]
@@ -275,6 +283,9 @@ class Onsets:
     heard: Bools  # (P, E, R): True for slices with an echo
     # (P, E), m: Range of the first echo; minus infinity without an echo, or if it is cut
     first: Floats
+    # (P, E, R) or None: True for slices in which the sweep's precursors lie below the noise; None
+    # of an impulse
+    undisturbed: Bools | None = None
 
     def chance(self, resolution: float) -> float:
         """Return the probability that noise alone makes at least this number of onsets.
@@ -303,8 +314,8 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
         power = np.stack([each.mean(axis=-1) for each in heard])
     else:
         power = np.stack([band_mean(each, store.frequency) for each in heard])
-    levels = threshold_levels(power, echo.looks)
     step = float(axis[1] - axis[0])
+    levels = threshold_levels(power, echo.looks, echo.ahead(step))
     fineness = echo.spacing / step
     start = np.zeros(power.shape[:2])
     if nearest is not None:
@@ -320,7 +331,8 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
         level = Levels(*(each[:, ear] for each in levels))
         onsets_of_ears.append(onsets(power[:, ear], level, window, fineness, start[:, ear]))
     first = axis[0] + step * np.stack(onsets_of_ears, axis=1)
-    return Onsets(poses, axis, power, (power > levels.total) & begun, first)
+    undisturbed = None if echo.precursors is None else levels.total <= levels.noise
+    return Onsets(poses, axis, power, (power > levels.total) & begun, first, undisturbed)
 
 
 NOISE_GAP = 2.0
@@ -341,6 +353,8 @@ def noise_rms(store: Ensemble, head: Head) -> Floats | None:
     quiet = (
         store.range[None, None] < onsets.first[..., None] - NOISE_GAP * head.resolution
     )  # (P, E, R)
+    if onsets.undisturbed is not None:
+        quiet &= onsets.undisturbed
     if (quiet.sum(axis=(0, 2)) < MIN_NOISE_SLICES).any():
         return None
     heard: list[list[Singles]] = [[] for _ in range(store.receivers)]

@@ -113,7 +113,7 @@ class EchoRegion:
     def box(self) -> Floats:
         """Return the box around all that explains the echoes, (2, 3) m, with a margin.
 
-        The margin is two range resolutions.
+        The margin is two range resolutions, or half of the longest side if that is less.
         """
         # The box of a flight along a line or on one side: as far ahead as it hears, and to the
         # sides.
@@ -134,7 +134,7 @@ class EchoRegion:
             if not len(kept):
                 raise NumericalError(NOTHING)
             lower, upper = kept.min(axis=0) - spacing / 2, kept.max(axis=0) + spacing / 2
-        margin = 2.0 * self.resolution
+        margin = min(2.0 * self.resolution, 0.5 * float((upper - lower).max()))
         return np.stack((lower - margin, upper + margin))
 
     def needed(self, points: Floats, tolerance: float) -> Bools:
@@ -202,12 +202,14 @@ MIN_POSE_FRACTION = 0.02
 """Fraction of the poses that must hear an echo at a range or beyond it for it to count, no unit."""
 
 
-def echo_extent(power: Floats, axis: Floats, looks: float, margin: float) -> tuple[float, float]:
+def echo_extent(
+    power: Floats, axis: Floats, looks: float, margin: float, ahead: Floats | None = None
+) -> tuple[float, float]:
     """Return the least and the greatest range (m) that hold echoes, with a margin.
 
-    In: power (P, E, R), axis ((R,), m), margin (m). Out: limits ((float, float), m).
+    In: power (P, E, R), axis ((R,), m), margin (m), ahead (L,). Out: limits ((float, float), m).
     """
-    loud: Bools = power > threshold_levels(power, looks).total
+    loud: Bools = power > threshold_levels(power, looks, ahead).total
     heard = np.asarray(loud.any(axis=1))  # (P, R)
     some = np.asarray(heard.any(axis=1))
     if not some.any():

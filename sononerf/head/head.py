@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter1d
 
 from sononerf.display import NotebookRepr
 from sononerf.errors import InputError, SettingsError
@@ -33,7 +34,9 @@ from sononerf.head.reception import (
     effective_window,
     loudest_power,
     noise_level,
+    precursors,
     speed_in,
+    suited,
     target_gain,
     within_band,
 )
@@ -62,6 +65,9 @@ class PointEcho:
     # (F, W) or None: The same of each row, which the window is the sum of; None where all rows are
     # about alike. If low rows swell more slowly, an echo without high frequencies does so too
     rows: Floats | None = None
+    # (L,): Power in front of it over its own, from near to far, as long as the call lasts; the same
+    # spacing. None of an impulse, which has none
+    precursors: Floats | None = None
 
     @classmethod
     def of(
@@ -78,7 +84,23 @@ class PointEcho:
             rows=None if part is None else rows**2 * (part * kept)[:, None],
             spacing=speed_of_sound / 2.0 / spectrogram.sampling_rate,
             looks=filters.looks,
+            precursors=None if call.kind == "impulse" else precursors(call, spectrogram),
         )
+
+    def ahead(self, step: float) -> Floats:
+        """Return the precursors (L,) of slices a step (m) apart.
+
+        Of those before the echo itself the loudest within a resolution counts: echoes of several
+        points add up.
+        """
+        if self.precursors is None:
+            return np.zeros(0)
+        size = 2 * math.ceil(self.resolution / self.spacing)
+        whole = np.pad(self.precursors, (0, size))
+        before = np.where(np.arange(len(whole)) < size, 0.0, whole)
+        loudest = np.maximum(whole, maximum_filter1d(before, size + 1))
+        count = int(len(loudest) * self.spacing / step)
+        return np.asarray(loudest[(np.arange(1, count + 1) * step / self.spacing).astype(int) - 1])
 
     def of_spectrum(self, magnitude: NDArray[np.floating]) -> Floats:
         """Return the window (W,) of an echo whose rows have some magnitudes (F,)."""
@@ -178,6 +200,7 @@ class Head(NotebookRepr):
             ("support", SupportSettings, support),
         ):
             object.__setattr__(self, name, checked_section(kind, given or {}, name))
+        object.__setattr__(self, "spectrogram", suited(self.call, self.spectrogram))
         if isinstance(self.noise.snr_db, tuple) and len(self.receivers) != 2:
             count = len(self.receivers)
             raise SettingsError(

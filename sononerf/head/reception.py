@@ -25,7 +25,14 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
-from sononerf.head.call import call_waveform, covered, has_ghosts, sweep_delay, sweep_rate
+from sononerf.head.call import (
+    call_waveform,
+    covered,
+    has_ghosts,
+    load_call,
+    sweep_delay,
+    sweep_rate,
+)
 from sononerf.head.front_end import dechirped_spectrogram, echo_samples, frequency_axis
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION, row_filters, row_widths
 from sononerf.numerics import Floats
@@ -171,8 +178,8 @@ def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
 logger = logging.getLogger("sononerf")
 
 MAX_WINDOW_RATIO = 2.0  # ratio of a window to the best one, or its inverse, that is worth a warning
-MIN_ECHO = 1e-2
-"""Magnitude, over that at its own range, down to which a point echo is followed over time."""
+FAINT_POWER = 1e-3
+"""Fraction of a point echo's power that may lie beyond the times at which it is followed."""
 MAX_OTHER_ECHO = 4.0
 """Largest magnitude of another harmonic's echo of a point over that of its own: 12 dB."""
 
@@ -212,6 +219,35 @@ def best_window(call: CallSettings, spectrogram: SpectrogramSettings) -> int:
     slowness = math.sqrt(np.mean(sweep_rate(call, _heard(call, spectrogram)) ** -2.0))
     return round(
         spectrogram.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness)
+    )
+
+
+def suited(call: CallSettings, spectrogram: SpectrogramSettings) -> SpectrogramSettings:
+    """Return the analysis, with the keys that were not set chosen for a sweep.
+
+    The band is what the call covers, the window keeps a point echo shortest, and the hop is a
+    sixteenth of it, as for an impulse.
+    """
+    given = spectrogram.model_fields_set
+    if call.kind == "impulse":
+        return spectrogram
+    if not {"frequency_min", "frequency_max"} & given:
+        ends = np.array(load_call(call.file).bands if call.file else list(call.bands.values()))
+        high = min(float(ends.max()), spectrogram.sampling_rate / 2.0)
+        band = {"frequency_min": float(ends.min()), "frequency_max": high}
+        if band["frequency_min"] < high:
+            kept = {name: getattr(spectrogram, name) for name in given}
+            spectrogram = SpectrogramSettings.model_validate({**kept, **band})
+    if spectrogram.kind == "gammatone":
+        return spectrogram
+    window = spectrogram.window if "window" in given else max(best_window(call, spectrogram), 8)
+    chosen = {
+        "window": window,
+        "hop": max(window // 16, 1),
+        "fft": max(spectrogram.fft, 2 ** math.ceil(math.log2(window))),
+    }
+    return spectrogram.model_copy(
+        update={name: value for name, value in chosen.items() if name not in given}
     )
 
 
@@ -267,6 +303,23 @@ def _point_echo(call: CallSettings, spectrogram: SpectrogramSettings, side: floa
     return dechirped_spectrogram(echo, fine, 2.0, delay)[0].T[:, :count]
 
 
+def precursors(call: CallSettings, spectrogram: SpectrogramSettings) -> Floats:
+    """Return the power of a point echo in front of its top over that of the top, one per sample.
+
+    A row hears a little of the frequencies that a sweep emits before its own.
+    """
+    side = (
+        row_filters(spectrogram).envelope.shape[1]
+        + call_waveform(call, spectrogram.sampling_rate).size
+    )
+    row = _point_echo(call, spectrogram, side)
+    heard = covered(call, within_band(spectrogram))
+    row = row[heard] if heard.any() else row
+    middle = (row.shape[1] - 1) // 2
+    power = np.square(row / np.maximum(row[:, middle, None], 1e-12 * row.max())).mean(axis=0)
+    return np.asarray(power[:middle][::-1] / power[middle])
+
+
 def _cropped(row: Floats, call: CallSettings, spectrogram: SpectrogramSettings) -> Floats:
     """Return point echoes over their height at their own range, without faint columns."""
     width = row.shape[1]
@@ -276,8 +329,9 @@ def _cropped(row: Floats, call: CallSettings, spectrogram: SpectrogramSettings) 
     if not heard.all() and heard.any():
         window[~heard] = np.minimum(window[~heard], 1.0)  # it has no middle of its own
     window = np.minimum(window, MAX_OTHER_ECHO)
-    loud = np.flatnonzero((window[heard] if heard.any() else window).max(axis=0) >= MIN_ECHO)
-    spare = min(int(loud[0]), width - 1 - int(loud[-1]))
+    power = np.square(window[heard] if heard.any() else window).sum(axis=0)
+    ends = np.cumsum(power + power[::-1])  # from both ends on
+    spare = int(np.searchsorted(ends, FAINT_POWER * power.sum()))
     return window[:, spare : width - spare]
 
 

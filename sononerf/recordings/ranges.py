@@ -352,7 +352,9 @@ def range_limits(
             heard = wide.analyse(cutter.echo(number, wide.samples))
             power.append(np.square(heard).mean(axis=-1))
             task.advance()
-    found = echo_extent(np.stack(power), wide.range, head.point_echo.looks, 2.0 * head.resolution)
+    echo = head.point_echo
+    ahead = echo.ahead(float(wide.range[1] - wide.range[0]))
+    found = echo_extent(np.stack(power), wide.range, echo.looks, 2.0 * head.resolution, ahead)
     limits = {
         "range_min": low if "range_min" in given else round(found[0], 4),
         "range_max": high if "range_max" in given else round(found[1], 4),

@@ -114,9 +114,9 @@ OWN_KEYS = ("spectrogram.dynamic_range_db",)
 
 
 def with_store(settings: Settings) -> Settings:
-    """Complete the settings from the store, if the echoes come from one."""
+    """Complete the settings from the store, if the echoes come from one, and from the call."""
     if settings.scene is not None or settings.data.store is None:
-        return settings
+        return settings.model_copy(update={"spectrogram": head_of(settings).spectrogram})
     path = settings.data.store
     stated = stated_head(EnsembleStore.open(path))
     resolved = settings.plain()

@@ -59,7 +59,13 @@ from sononerf.settings.loading import (
     read_yaml,
     validate_settings,
 )
-from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, CallSettings, Settings
+from sononerf.settings.schema import (
+    FILE_SECTIONS,
+    HEAD_SECTIONS,
+    CallSettings,
+    Settings,
+    SpectrogramSettings,
+)
 from sononerf.settings.sections import ImportSettings
 
 FOLDER = "recordings"
@@ -136,6 +142,7 @@ def plan_import(
         cutter = replace(cutter, call=call_waveform(settings.call, recording.sampling_rate))
         calibration["compressed"] = call_content(settings.call)
         settings = settings.model_copy(update={"call": CallSettings()})
+    settings = settings.model_copy(update={"spectrogram": head_of(settings).spectrogram})
     check_numbers(recording, cutter, 0)
     limits, power = range_limits(
         head_of(settings), cutter, recording, data.get("spectrogram", {}), progress
@@ -236,12 +243,11 @@ def _complete(
                 f"{recording.sampling_rate:g} Hz; leave it out"
             )
     settings = validate_settings({**data, "data": {"store": str(output)}}, where)
-    band = {"frequency_min", "frequency_max"}
-    if settings.call.bands and not band & settings.spectrogram.model_fields_set:
-        ends = np.asarray(list(settings.call.bands.values()))
+    if not {"frequency_min", "frequency_max"} & settings.spectrogram.model_fields_set:
+        # With pulse compression too the band is that of the call.
+        suiting = head_of(settings).spectrogram
         data["spectrogram"] |= {
-            "frequency_min": float(ends.min()),
-            "frequency_max": min(float(ends.max()), recording.sampling_rate / 2.0),
+            name: getattr(suiting, name) for name in ("frequency_min", "frequency_max")
         }
         settings = validate_settings({**data, "data": {"store": str(output)}}, where)
     return settings
@@ -489,7 +495,8 @@ def describe_plan(plan: ImportPlan) -> list[str]:
         _cost_line(plan),
         *(_channel_line(number, channel) for number, channel in enumerate(plan.channels)),
     ]
-    of_impulse = replace(plan.head, call=CallSettings())
+    own = plan.settings.spectrogram.model_dump(exclude={"window", "hop", "fft"})
+    of_impulse = replace(plan.head, call=CallSettings(), spectrogram=SpectrogramSettings(**own))
     here, there = (1e3 * head.resolution for head in (plan.head, of_impulse))
     if here > MIN_COMPRESSION_GAIN * there:
         lines.append(

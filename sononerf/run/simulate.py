@@ -211,7 +211,7 @@ def write_waveforms(
             )
             storage.commit_bytes(folder / name, wav_bytes(waveform, rate))
             task.advance()
-    plain = settings.plain()
+    plain = simulator.head.plain()
     sections = {name: plain[name] for name in HEAD_SECTIONS}
     source = f"simulated, scene {settings.scene.name}" if settings.scene else ""
     sections["import"] = {"source": source}

@@ -226,7 +226,8 @@ def check_call(call: CallSettings, spectrogram: SpectrogramSettings) -> None:
                 "the harmonic out (amplitude 0) or raise the rate"
             )
     low, high = spectrogram.frequency_min, spectrogram.frequency_max
-    if bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
+    is_set = {"frequency_min", "frequency_max"} & spectrogram.model_fields_set
+    if is_set and bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
         swept = ", ".join(f"{lo:g} to {hi:g} Hz" for lo, hi in bands.values())
         raise ValueError(
             f"call: sweeps {swept}, all outside spectrogram.frequency_min to frequency_max "

@@ -192,7 +192,11 @@ def test_a_wrong_value_is_told_with_file_key_and_way_out(write, key, words):
         ),
         (["spectrogram.sampling_rate=250e3"], "call: harmonic 1 reaches 150000 Hz"),
         (
-            ["call.frequency_start=200e3", "call.frequency_end=120e3"],
+            [
+                "call.frequency_start=200e3",
+                "call.frequency_end=120e3",
+                "spectrogram.frequency_max=100e3",
+            ],
             "call: sweeps 120000 to 200000 Hz, all outside spectrogram.frequency_min",
         ),
     ],
