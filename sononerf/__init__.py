@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sononerf.display import show_by
 
 if TYPE_CHECKING:
+    from sononerf import testing as testing
     from sononerf.echoes.echoes import Echoes
     from sononerf.evaluation.numbers import Comparison, Evaluation, evaluate
     from sononerf.evaluation.prediction import Prediction, predict
@@ -94,6 +95,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "testing":
+        return importlib.import_module("sononerf.testing")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"sononerf.{_HOMES[name]}"), name)

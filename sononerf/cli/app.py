@@ -111,6 +111,9 @@ def complete() -> typer.Typer:
 
 def run() -> int:
     """Run the given command and return its exit code; its exceptions pass through."""
+    quiet = [word for word in sys.argv[1:] if word in ("-q", "--quiet")]
+    # It may stand behind the command too.
+    sys.argv[1:] = [*quiet[:1], *(word for word in sys.argv[1:] if word not in quiet)]
     for word in sys.argv[1:]:
         try:
             word.encode()

@@ -119,10 +119,17 @@ def fit(
     accelerator: OnWhat = "auto",
     devices: Annotated[int | None, typer.Option(min=1, help="Number of devices.")] = None,
     num_nodes: Annotated[int, typer.Option(min=1, help="Number of machines.")] = 1,
+    precision: Annotated[
+        str, typer.Option(help="Lightning's: 32-true, bf16-mixed, 64-true, ...")
+    ] = "32-true",
+    strategy: Annotated[str, typer.Option(help="Lightning's: auto, ddp, ddp_spawn, ...")] = "auto",
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the fit (fit.seed).")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Move an existing run aside first.")
+    ] = False,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print all settings as YAML, and end.")
     ] = False,
 ) -> None:
     """Simulate where needed, fit, reconstruct, predict the test poses and evaluate.
@@ -133,6 +140,12 @@ def fit(
 
     extra = [] if seed is None else [f"fit.seed={seed}"]
     settings = load_settings(config, [*(overrides or ()), *extra])
+    if print_config:
+        from sononerf.run.build import with_store
+        from sononerf.settings.loading import to_yaml
+
+        typer.echo(to_yaml(with_store(settings).plain()).rstrip())
+        return
     _begin(settings, workers)
     from sononerf.progress import Progress
     from sononerf.run.fit import follows
@@ -144,6 +157,8 @@ def fit(
         accelerator=accelerator,
         devices=devices or "auto",
         num_nodes=num_nodes,
+        precision=precision,
+        strategy=strategy,
         overwrite=overwrite,
         workers=workers,
         finishes=True,
@@ -173,7 +188,7 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
 
     prediction = metrics.get("prediction") or {}
     if prediction:
-        say(
+        typer.echo(
             f"prediction of {prediction['poses']} held-out poses: {prediction['mae_db']:.2f} dB "
             f"over all cells (mean spectrogram: {prediction['mean_predictor_mae_db']:.2f} dB)"
             + optional(prediction, "mae_db_active", "; {:.1f} dB over active cells")
@@ -181,7 +196,7 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
     geometry = metrics.get("geometry") or {}
     if geometry:
         scores = geometry["fscore"]
-        say(
+        typer.echo(
             f"geometry: Chamfer {1000 * geometry['chamfer_m']:.2f} mm, F-score "
             f"{scores['0.002']:.2f} at 2 mm and {scores['0.005']:.2f} at 5 mm, "
             f"{geometry['components']} part{'s' * (geometry['components'] != 1)} "
@@ -189,7 +204,7 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
         )
         other = (metrics.get("baseline") or {}).get("backprojection")
         if other:
-            say(
+            typer.echo(
                 f"backprojection instead: Chamfer {1000 * other['chamfer_m']:.2f} mm, F-score "
                 f"{other['fscore']['0.002']:.2f} at 2 mm and {other['fscore']['0.005']:.2f} at 5 mm"
             )
@@ -197,17 +212,17 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
     found = storage.read_json(known) if known.is_file() else {}
     if found.get("median_error_m"):
         now, twice = (1e3 * found[f"median_error_{key}m"] for key in ("", "from_twice_"))
-        say(
-            f"error of the surface: {now:.2f} mm (90 %, median of the vertices); from twice as "
-            f"many poses about {twice:.2f} mm"
+        typer.echo(
+            f"error of the surface: {now:.2f} mm (90 %, median of the vertices); with twice as "
+            f"many poses it would be about {twice:.2f} mm"
         )
     if (folder / "report.html").is_file():
-        say(f"report:      {folder / 'report.html'}")
+        typer.echo(f"report:      {folder / 'report.html'}")
     for mesh in sorted((folder / "reconstruction").glob("mesh*.ply")):
-        say(f"mesh:        {mesh}")
-    say(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
-    say(f"numbers:     {folder / 'metrics.json'}")
-    say(f"TensorBoard: tensorboard --logdir {folder}")
+        typer.echo(f"mesh:        {mesh}")
+    typer.echo(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
+    typer.echo(f"numbers:     {folder / 'metrics.json'}")
+    typer.echo(f"TensorBoard: tensorboard --logdir {folder}")
 
 
 @app.command()

@@ -83,7 +83,8 @@ def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> 
         raise InputError(f"{where} has shape {given.shape}, expected ({len(poses)},), one per pose")
     uses: dict[Any, int] = {**SPLITS, **{number: number for number in SPLITS.values()}}
     values = given.tolist()
-    wrong = next((value for value in values if value not in uses), None)
+    # True would be equal to 1, which is validation.
+    wrong = next((one for one in values if isinstance(one, bool) or one not in uses), None)
     if wrong is not None:
         raise InputError(f"{where}: found {wrong!r}, expected train, val or test, or 0, 1 or 2")
     found = np.array([uses[value] for value in values], dtype=np.int8)

@@ -15,6 +15,7 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
@@ -128,6 +129,8 @@ def fit(
     accelerator: str = "auto",
     devices: int | str = "auto",
     num_nodes: int = 1,
+    precision: str = "32-true",
+    strategy: str = "auto",
 ) -> EchoModule:
     """Fit a module to echoes and validate after each epoch, as the command ``fit`` does.
 
@@ -143,13 +146,14 @@ def fit(
         logger: Logger of scalars and pictures.
         folder: Default folder of Lightning and its callbacks.
         checkpoint: Checkpoint that the fit resumes; None starts anew.
-        accelerator, devices, num_nodes: As of Lightning's Trainer.
+        accelerator, devices, num_nodes, precision, strategy: As of Lightning's Trainer.
 
     Returns:
         model: Fitted.
 
     Raises:
-        SettingsError: If an option is not allowed, or options are given beside a model.
+        SettingsError: If an option is not allowed, or options are given beside a model, or
+            Lightning refuses precision or strategy.
         NumericalError: If a gradient or a parameter is not finite.
         ResourceError: If ``accelerator`` is ``gpu`` and there is none.
     """
@@ -159,25 +163,30 @@ def fit(
     elif options is not None:
         raise SettingsError("options: the model has its own; give them to EchoModule.for_echoes")
     quiet_lightning()
-    trainer = lightning.Trainer(
-        accelerator=accelerator,
-        devices=devices,
-        num_nodes=num_nodes,
-        max_epochs=model.options.epochs,
-        max_steps=model.options.max_steps or -1,
-        limit_val_batches=1.0 if len(echoes.store.indices("val")) else 0,
-        num_sanity_val_steps=0,
-        gradient_clip_val=model.options.gradient_clip,
-        logger=logger or False,
-        callbacks=list(callbacks),
-        plugins=[DurableCheckpointIO()],
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        use_distributed_sampler=False,
-        log_every_n_steps=5,
-        default_root_dir=folder,
-    )
+    try:
+        trainer = lightning.Trainer(
+            accelerator=accelerator,
+            devices=devices,
+            num_nodes=num_nodes,
+            precision=precision,  # type: ignore[arg-type]  # it checks the word itself
+            strategy=strategy,
+            max_epochs=model.options.epochs,
+            max_steps=model.options.max_steps or -1,
+            limit_val_batches=1.0 if len(echoes.store.indices("val")) else 0,
+            num_sanity_val_steps=0,
+            gradient_clip_val=model.options.gradient_clip,
+            logger=logger or False,
+            callbacks=list(callbacks),
+            plugins=[DurableCheckpointIO()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            log_every_n_steps=5,
+            default_root_dir=folder,
+        )
+    except (ValueError, MisconfigurationException) as error:
+        raise SettingsError(f"Lightning: {' '.join(str(error).split())}") from None
     trainer.fit(model, data or EchoDataModule(echoes), ckpt_path=checkpoint, weights_only=True)
     bad = [n for n, p in model.named_parameters() if not bool(p.isfinite().all())]
     if bad:

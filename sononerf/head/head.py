@@ -12,6 +12,7 @@ Frames and units: ``docs/receivers.md``; how a call is heard: ``docs/simulator.m
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -187,10 +188,11 @@ class Head(NotebookRepr):
         **unknown: object,
     ) -> None:
         if unknown:
-            listed = ", ".join(SECTIONS).replace(
-                "spectrogram", "spectrogram (analysis before 0.2.0)"
-            )
-            raise SettingsError(f"Head: unknown section {next(iter(unknown))!r}; known: {listed}")
+            name = next(iter(unknown))
+            near = difflib.get_close_matches(name, [*SECTIONS, "analysis"], n=1)
+            meant = near[0].replace("analysis", "spectrogram") if near else ""
+            hint = f"did you mean {meant}?" if near else f"known: {', '.join(SECTIONS)}"
+            raise SettingsError(f"Head: unknown section {name!r}; {hint}")
         for name, kind, given in (
             ("ears", EarSettings, ears),
             ("call", CallSettings, call),
@@ -231,6 +233,13 @@ class Head(NotebookRepr):
         """Return the same head with receivers that have no noise."""
         return (
             self if self.noise.snr_db is None else dataclasses.replace(self, noise=NoiseSettings())
+        )
+
+    def of_impulse(self) -> Head:
+        """Return the same head with an impulse, and the analysis that suits it in this band."""
+        own = self.spectrogram.model_dump(exclude={"window", "hop", "fft"})
+        return dataclasses.replace(
+            self, call=CallSettings(), spectrogram=SpectrogramSettings(**own)
         )
 
     @cached_property

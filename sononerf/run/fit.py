@@ -249,6 +249,8 @@ def fit(
     accelerator: str = "auto",
     devices: int | str = "auto",
     num_nodes: int = 1,
+    precision: str = "32-true",
+    strategy: str = "auto",
     overwrite: bool = False,
     workers: int | None = None,
     finishes: bool = False,
@@ -265,6 +267,7 @@ def fit(
         accelerator: Device to fit on.
         devices: Number of devices.
         num_nodes: Number of machines.
+        precision, strategy: As of Lightning's Trainer.
         overwrite: Move a folder that is there aside.
         workers: Processes that simulate.
         finishes: True also runs the stages after the fit, see :func:`sononerf.run.fit.finish`.
@@ -283,7 +286,13 @@ def fit(
     settings = with_store(settings)
     head = head_of(settings)
     module_for(settings, head, None, 1.0)  # unknown names and options are refused at once
-    hardware = {"accelerator": accelerator, "devices": devices, "num_nodes": num_nodes}
+    hardware = {
+        "accelerator": accelerator,
+        "devices": devices,
+        "num_nodes": num_nodes,
+        "precision": precision,
+        "strategy": strategy,
+    }
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
         echoes = Echoes(_wait_for_store(settings, path), head)
@@ -356,6 +365,12 @@ def _prepared(
     corners = (1000 * module.field.region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     box = module.field.region.double().numpy()
+    if echoes.head.call.kind != "impulse":
+        progress.say(
+            f"call: a point's echo is {1e3 * echoes.head.resolution:.0f} mm long in range, that of "
+            f"an impulse {1e3 * echoes.head.of_impulse().resolution:.0f} mm; parts of a body that "
+            "are nearer in range merge"
+        )
     for line in [] if follows() else fit_warnings(echoes, box, is_set=lower is not None):
         logger.warning("%s", line)
     data = EchoDataModule(

@@ -59,13 +59,7 @@ from sononerf.settings.loading import (
     read_yaml,
     validate_settings,
 )
-from sononerf.settings.schema import (
-    FILE_SECTIONS,
-    HEAD_SECTIONS,
-    CallSettings,
-    Settings,
-    SpectrogramSettings,
-)
+from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, CallSettings, Settings
 from sononerf.settings.sections import ImportSettings
 
 FOLDER = "recordings"
@@ -495,9 +489,7 @@ def describe_plan(plan: ImportPlan) -> list[str]:
         _cost_line(plan),
         *(_channel_line(number, channel) for number, channel in enumerate(plan.channels)),
     ]
-    own = plan.settings.spectrogram.model_dump(exclude={"window", "hop", "fft"})
-    of_impulse = replace(plan.head, call=CallSettings(), spectrogram=SpectrogramSettings(**own))
-    here, there = (1e3 * head.resolution for head in (plan.head, of_impulse))
+    here, there = (1e3 * head.resolution for head in (plan.head, plan.head.of_impulse()))
     if here > MIN_COMPRESSION_GAIN * there:
         lines.append(
             f"note:       ranges are resolved to {here:.0f} mm; import.compress=true resolves "
