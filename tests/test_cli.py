@@ -232,11 +232,11 @@ def test_it_learns(smoke):
 
 
 def test_what_is_printed(smoke):
-    assert smoke.simulated.out == smoke.fit.out == ""
+    assert smoke.simulated.out == ""
     assert "wrote data/three_spheres-" in smoke.simulated.err
-    text = smoke.fit.err
+    assert "region " in smoke.fit.err
+    text = smoke.fit.out  # results, with --quiet too
     for words in (
-        "region ",
         "prediction of 3 held-out poses: ",
         "geometry: Chamfer ",
         "parts (true: 3)",
@@ -249,7 +249,7 @@ def test_what_is_printed(smoke):
         assert words in text
     # Plain lines where there is no terminal; nothing of the libraries' own talk.
     for noise in ("\x1b", "\r", "━", "LeafSpec", "GPU available", "lightning.pytorch", "Tip:"):
-        assert noise not in text
+        assert noise not in text + smoke.fit.err
     assert len(list((smoke.home / "data").iterdir())) == 1  # the fit took what was simulated
 
 
@@ -257,8 +257,9 @@ def test_a_finished_run_is_left_as_it_is_and_says_so(at_home):
     before = tree(at_home.run)
     result = done("fit", SMOKE, "--accelerator", "cpu")
     assert "runs/smoke: is finished; --overwrite fits it anew" in result.err
-    assert "geometry: Chamfer" in result.err
+    assert "geometry: Chamfer" in result.out
     assert tree(at_home.run) == before
+    assert done("fit", SMOKE, "--accelerator", "cpu", "--quiet").out == result.out
 
 
 def test_the_error_is_told_and_what_twice_as_many_poses_would_change(at_home):
@@ -267,11 +268,26 @@ def test_the_error_is_told_and_what_twice_as_many_poses_would_change(at_home):
     errors = {"median_error_m": 5e-4, "median_error_from_twice_m": 4e-4}
     file.write_text(json.dumps(json.loads(known) | errors))
     try:
-        said = done("fit", SMOKE, "--accelerator", "cpu").err
+        said = done("fit", SMOKE, "--accelerator", "cpu").out
     finally:
         file.write_text(known)
     assert "error of the surface: 0.50 mm" in said
-    assert "twice as many poses about 0.40 mm" in said
+    assert "twice as many poses it would be about 0.40 mm" in said
+
+
+def test_all_settings_are_printed_and_make_the_same(at_home, tmp_path):
+    call = ["call.kind=linear", "call.duration=3e-3", "call.frequency_end=30e3"]
+    text = done("fit", SMOKE, *call, "--print-config").out
+    (tmp_path / "all.yaml").write_text(text)
+    assert done("fit", tmp_path / "all.yaml", "--print-config").out == text
+    analysis = read_yaml(tmp_path / "all.yaml")["spectrogram"]
+    assert (analysis["frequency_min"], analysis["frequency_max"]) == (30e3, 150e3)
+    assert analysis["hop"] == analysis["window"] // 16 > 4
+
+
+def test_a_precision_that_lightning_refuses_is_one_line(at_home, tmp_path):
+    output = ["--output", tmp_path / "run"]
+    assert "Lightning: Precision '15'" in refused(2, "fit", SMOKE, *output, "--precision", "15")
 
 
 def test_other_settings_in_the_same_folder_are_refused(at_home):

@@ -46,3 +46,15 @@ def test_a_scene_of_a_file_has_its_unit_and_material(tmp_path):
 def test_a_section_of_the_head_that_has_another_name_is_told():
     with pytest.raises(SettingsError, match="unknown section 'analysis'; did you mean spectrogram"):
         sononerf.Head(analysis={"window": 64})
+
+
+def test_a_boolean_split_is_refused():
+    """True would be 1, which is validation."""
+    head, poses = sononerf.Head(), sononerf.Poses.sphere(4, radius=0.4)
+    heard = np.ones((4, 2, len(head.range), len(head.frequency)))
+    with pytest.raises(InputError, match="split: found True, expected train, val or test"):
+        sononerf.Echoes.from_arrays(heard, poses, head, split=[True, True, False, False])
+
+
+def test_testing_is_reached_by_its_name():
+    assert sononerf.testing.check_field

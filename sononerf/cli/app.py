@@ -100,6 +100,24 @@ def _root(
         say(context.get_help())
         raise typer.Exit(SettingsError.exit_code)
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
+    for handler in logging.getLogger().handlers:
+        handler.filters = [one for one in handler.filters if not isinstance(one, _Once)]
+        handler.addFilter(_Once())
+
+
+class _Once(logging.Filter):
+    """Lets each line through once: one command may make a scene several times."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return True if the line is new."""
+        line = record.getMessage()
+        is_new = line not in self.said
+        self.said.add(line)
+        return is_new
 
 
 def complete() -> typer.Typer:

@@ -328,7 +328,10 @@ class Echoes(NotebookRepr):
     def region(self) -> EchoRegion:
         """Places that the echoes leave possible."""
         rotations = self.rotations[self.onsets.poses]
-        return EchoRegion(self.onsets, self.hull, self.head.gains, rotations, self.head.resolution)
+        head = self.head
+        return EchoRegion(
+            self.onsets, self.hull, head.gains, rotations, head.resolution, head.point_echo.tail
+        )
 
     @cached_property
     def bounds(self) -> Floats:

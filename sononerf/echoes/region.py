@@ -39,17 +39,23 @@ MIN_POSES = 2  # poses: an echo of one pose alone may come from any place of an 
 
 
 class EchoRegion:
-    """Evidence of the poses about places. In: rotations (P, 3, 3), resolution (m)."""
+    """Evidence of the poses about places. In: rotations (P, 3, 3), resolution, tail (m)."""
 
     def __init__(
-        self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Floats, resolution: float
+        self,
+        heard: Onsets,
+        hull: EchoHull,
+        ears: Ears,
+        rotations: Floats,
+        resolution: float,
+        tail: float = 0.0,
     ) -> None:
         if not np.isfinite(hull.inlier_onsets).any():
             raise NumericalError(NOTHING)
         if heard.chance(resolution) > FALSE_ALARMS:
             count, of = int(np.isfinite(heard.first).sum()), heard.first.size
             raise NumericalError(NOISE.format(count=count, of=of))
-        self.hull, self.resolution, self.range = hull, resolution, heard.range
+        self.hull, self.resolution, self.tail, self.range = hull, resolution, tail, heard.range
         self.step = float(heard.range[1] - heard.range[0])
         count = len(heard.poses)
         sampled = np.linspace(0, count - 1, min(POSES, count)).astype(int)
@@ -194,7 +200,10 @@ class EchoRegion:
             pose = np.broadcast_to(np.arange(len(row))[:, None], row.shape)
             covered[pose[within], row[within]] = True
         half_width = int(np.ceil((tolerance + self.resolution) / self.step))
-        covered = ndimage.maximum_filter1d(covered, 2 * half_width + 1, axis=1, mode="constant")
+        behind = int(np.ceil(self.tail / self.step / 2.0))
+        covered = ndimage.maximum_filter1d(
+            covered, 2 * (half_width + behind) + 1, axis=1, mode="constant", origin=behind
+        )
         return np.asarray(covered)
 
 

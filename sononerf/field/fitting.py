@@ -116,6 +116,19 @@ def usable_accelerator(accelerator: str) -> str:
     return "cpu" if accelerator == "auto" and not there else accelerator
 
 
+def require_lightning(**hardware: Any) -> None:
+    """Refuse what Lightning's Trainer refuses.
+
+    Raises:
+        SettingsError: With Lightning's words.
+    """
+    try:
+        quiet_lightning()
+        lightning.Trainer(**hardware, accelerator="cpu", logger=False, enable_checkpointing=False)
+    except (ValueError, MisconfigurationException) as error:
+        raise SettingsError(f"Lightning: {' '.join(str(error).split())}") from None
+
+
 def fit(
     echoes: Echoes,
     model: EchoModule | None = None,
@@ -163,30 +176,28 @@ def fit(
     elif options is not None:
         raise SettingsError("options: the model has its own; give them to EchoModule.for_echoes")
     quiet_lightning()
-    try:
-        trainer = lightning.Trainer(
-            accelerator=accelerator,
-            devices=devices,
-            num_nodes=num_nodes,
-            precision=precision,  # type: ignore[arg-type]  # it checks the word itself
-            strategy=strategy,
-            max_epochs=model.options.epochs,
-            max_steps=model.options.max_steps or -1,
-            limit_val_batches=1.0 if len(echoes.store.indices("val")) else 0,
-            num_sanity_val_steps=0,
-            gradient_clip_val=model.options.gradient_clip,
-            logger=logger or False,
-            callbacks=list(callbacks),
-            plugins=[DurableCheckpointIO()],
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            use_distributed_sampler=False,
-            log_every_n_steps=5,
-            default_root_dir=folder,
-        )
-    except (ValueError, MisconfigurationException) as error:
-        raise SettingsError(f"Lightning: {' '.join(str(error).split())}") from None
+    require_lightning(precision=precision, strategy=strategy)
+    trainer = lightning.Trainer(
+        accelerator=accelerator,
+        devices=devices,
+        num_nodes=num_nodes,
+        precision=precision,  # type: ignore[arg-type]  # it checks the word itself
+        strategy=strategy,
+        max_epochs=model.options.epochs,
+        max_steps=model.options.max_steps or -1,
+        limit_val_batches=1.0 if len(echoes.store.indices("val")) else 0,
+        num_sanity_val_steps=0,
+        gradient_clip_val=model.options.gradient_clip,
+        logger=logger or False,
+        callbacks=list(callbacks),
+        plugins=[DurableCheckpointIO()],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=5,
+        default_root_dir=folder,
+    )
     trainer.fit(model, data or EchoDataModule(echoes), ckpt_path=checkpoint, weights_only=True)
     bad = [n for n, p in model.named_parameters() if not bool(p.isfinite().all())]
     if bad:

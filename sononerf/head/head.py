@@ -88,6 +88,16 @@ class PointEcho:
             precursors=None if call.kind == "impulse" else precursors(call, spectrogram),
         )
 
+    @property
+    def tail(self) -> float:
+        """Distance by which it goes on behind its own range and resolution, at -20 dB, m.
+
+        Nothing of an impulse; of a call of harmonics that overlap it holds their later echoes.
+        """
+        loud = np.flatnonzero(self.window >= 0.01 * self.window.max())
+        behind = (int(loud[-1]) - (len(self.window) - 1) / 2.0) * self.spacing
+        return max(behind - self.resolution, 0.0)
+
     def ahead(self, step: float) -> Floats:
         """Return the precursors (L,) of slices a step (m) apart.
 

@@ -225,14 +225,19 @@ def best_window(call: CallSettings, spectrogram: SpectrogramSettings) -> int:
 def suited(call: CallSettings, spectrogram: SpectrogramSettings) -> SpectrogramSettings:
     """Return the analysis, with the keys that were not set chosen for a sweep.
 
-    The band is what the call covers, the window keeps a point echo shortest, and the hop is a
-    sixteenth of it, as for an impulse.
+    The band is what the loudest harmonic covers, of equally loud ones the highest, which sweeps
+    fastest: where two overlap every point is heard twice. The window keeps a point echo shortest,
+    and the hop is a sixteenth of it, as for an impulse.
     """
     given = spectrogram.model_fields_set
     if call.kind == "impulse":
         return spectrogram
     if not {"frequency_min", "frequency_max"} & given:
-        ends = np.array(load_call(call.file).bands if call.file else list(call.bands.values()))
+        if call.file is None:
+            loudest = max(call.bands, key=lambda number: (call.harmonics[number - 1], number))
+            ends = np.array(call.bands[loudest])
+        else:
+            ends = np.array(load_call(call.file).bands)
         high = min(float(ends.max()), spectrogram.sampling_rate / 2.0)
         band = {"frequency_min": float(ends.min()), "frequency_max": high}
         if band["frequency_min"] < high:

@@ -31,7 +31,7 @@ from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import save_weights
 from sononerf.field.datamodule import EchoDataModule
-from sononerf.field.fitting import StepCost, step_cost, usable_accelerator
+from sononerf.field.fitting import StepCost, require_lightning, step_cost, usable_accelerator
 from sononerf.field.fitting import fit as fit_field
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses, aim_fault
@@ -283,6 +283,7 @@ def fit(
     progress = progress or Progress(quiet=True)
     run = Run(path)
     usable_accelerator(accelerator)
+    require_lightning(precision=precision, strategy=strategy)
     settings = with_store(settings)
     head = head_of(settings)
     module_for(settings, head, None, 1.0)  # unknown names and options are refused at once

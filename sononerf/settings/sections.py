@@ -65,6 +65,30 @@ CALL_PRESETS = {
         "2005: duration (1 ms or less close to a fruit, 4.5 ms in free flight), frequencies, "
         "harmonics. Hyperbolic, and the harmonics' amplitudes, are typical.",
     ),
+    "micronycteris_microtis": CallPreset(
+        {
+            "kind": "hyperbolic",
+            "duration": 0.5e-3,
+            "frequency_start": 55e3,
+            "frequency_end": 33e3,
+            "harmonics": (0.3, 1.0, 0.5),
+        },
+        "common big-eared bat, gleaning from leaves: three harmonics, the loudest 110 to 66 kHz",
+        "I. Geipel, K. Jung and E. K. V. Kalko, Proceedings of the Royal Society B 280:20122830, "
+        "2013: short, of several harmonics and broad. All numbers are typical.",
+    ),
+    "fm_1ms": CallPreset(
+        {"kind": "linear", "duration": 1e-3, "frequency_start": 90e3, "frequency_end": 30e3},
+        "a straight sweep from 90 to 30 kHz in a millisecond",
+        "H.-U. Schnitzler and E. K. V. Kalko, BioScience 51(7):557-569, 2001, on sweeps near "
+        "obstacles. Of no species; all numbers are typical.",
+    ),
+    "fm_3ms": CallPreset(
+        {"kind": "linear", "duration": 3e-3, "frequency_start": 90e3, "frequency_end": 30e3},
+        "a straight sweep from 90 to 30 kHz in three milliseconds",
+        "H.-U. Schnitzler and E. K. V. Kalko, BioScience 51(7):557-569, 2001, on sweeps of bats "
+        "that search. Of no species; all numbers are typical.",
+    ),
     "rhinolophus_fm": CallPreset(
         {"kind": "linear", "duration": 0.87e-3, "frequency_start": 83e3, "frequency_end": 63e3},
         "greater horseshoe bat, the sweep that ends the call; its constant tone tells no range",

@@ -265,6 +265,11 @@ def _fill(
     here = 1 if scheduler is not None else workers
     rays = settle_rays(simulator, poses, options, progress, workers=here)
     store.update_attributes(rays=rays)
+    if len(test):
+        progress.say(
+            f"simulating {len(missing)} poses, and {len(test)} held-out ones again with other "
+            "rays: the difference is the noise floor"
+        )
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
         def keep(index: int, spectrogram: Singles) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.io import wavfile
 
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.head.front_end import (
@@ -214,3 +215,42 @@ def test_noise_is_a_function_of_the_seed_and_of_nothing_else_drawn_from_it():
     ]
     for other in others:
         assert abs(np.corrcoef(one[0], other)[0, 1]) < 0.06
+
+
+LONG = {"kind": "linear", "duration": 3e-3, "frequency_start": 90e3, "frequency_end": 30e3}
+
+
+def test_the_analysis_follows_from_the_call_where_it_is_not_set():
+    head, plain = Head(call=LONG), Head(spectrogram={"frequency_min": 30e3, "frequency_max": 90e3})
+    analysis = head.spectrogram
+    assert (analysis.frequency_min, analysis.frequency_max) == (30e3, 90e3)
+    other = [Head(call=LONG, spectrogram={"window": n}).resolution for n in (64, 128, 600, 1000)]
+    assert head.resolution < min(other)
+    # As many slices and rows make up the echo of a point as under an impulse.
+    slices = [one.resolution / (one.range[1] - one.range[0]) for one in (head, plain)]
+    assert 0.5 < slices[0] / slices[1] < 2.0
+    assert head.window.shape[1] / head.spectrogram.hop < 4 * plain.window.shape[1] / 4
+    kept = Head(call=LONG, spectrogram={"window": 128, "hop": 3, "frequency_min": 40e3}).spectrogram
+    assert (kept.window, kept.hop, kept.frequency_min) == (128, 3, 40e3)
+    assert Head.from_plain(head.plain()).spectrogram == analysis
+    assert head.of_impulse().resolution == pytest.approx(plain.resolution)
+
+
+def test_a_recorded_call_is_analysed_as_a_written_one(tmp_path):
+    written = Head(call=LONG)
+    file = tmp_path / "call.wav"
+    wavfile.write(file, 1_000_000, written.waveform.astype(np.float32))
+    recorded = Head(call={"kind": "file", "file": file})
+    for name, slack in (("window", 0.1), ("hop", 0.1), ("frequency_min", 0.1)):
+        a, b = (getattr(one.spectrogram, name) for one in (recorded, written))
+        assert a == pytest.approx(b, rel=slack), name
+    assert recorded.resolution == pytest.approx(written.resolution, rel=0.15)
+    assert recorded.window.shape[1] < 2 * written.window.shape[1]
+
+
+def test_precursors_of_a_sweep_reach_as_far_as_the_call():
+    assert Head().point_echo.ahead(0.001).size == 0
+    ahead = 10 * np.log10(Head(call=LONG).point_echo.ahead(0.004) + 1e-30)
+    length = 3e-3 * 343.0 / 2.0 / 0.004
+    assert -60.0 < ahead[int(0.5 * length)] < -20.0
+    assert ahead[int(1.2 * length) :].max(initial=-300.0) < -100.0

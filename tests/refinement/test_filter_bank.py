@@ -18,7 +18,8 @@ SOFT = 25e3
 
 
 def bank_of(kind, harmonics=(1.0,), analysis_kind="stft", **changes):
-    spectrogram = SpectrogramSettings(range_min=0.2, range_max=0.5, kind=analysis_kind, **changes)
+    given = {"frequency_min": 10e3, "frequency_max": 100e3, "window": 64, "hop": 4, **changes}
+    spectrogram = SpectrogramSettings(range_min=0.2, range_max=0.5, kind=analysis_kind, **given)
     call = CallSettings(kind=kind, harmonics=harmonics, frequency_end=40e3 / len(harmonics))
     reception = Head(call=call, spectrogram=spectrogram)
     return FilterBank(reception, NODES, SOFT), reception
