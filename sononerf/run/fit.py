@@ -71,6 +71,11 @@ GRID_SIDE = 8
 """Number of places along each side of the region whose distance from the poses is checked."""
 
 
+SWEEP_ERROR = 1.0 / 7.0
+"""Error of a surface over the length of a point's echo under a sweep, no unit: 0.14 to 0.22 for
+three spheres and 0.10 to 0.15 for another body under sweeps of 0.4 to 3 ms (``docs/calls.md``)."""
+
+
 def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     """Return warnings about a fit, one line each. In: region ((2, 3), m)."""
     training = echoes.poses("train")
@@ -367,10 +372,11 @@ def _prepared(
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     box = module.field.region.double().numpy()
     if echoes.head.call.kind != "impulse":
+        long, short = (1e3 * one.resolution for one in (echoes.head, echoes.head.of_impulse()))
         progress.say(
-            f"call: a point's echo is {1e3 * echoes.head.resolution:.0f} mm long in range, that of "
-            f"an impulse {1e3 * echoes.head.of_impulse().resolution:.0f} mm; parts of a body that "
-            "are nearer in range merge"
+            f"call: a point's echo is {long:.0f} mm long in range, that of an impulse {short:.0f} "
+            "mm: parts of a body that are nearer in range merge, and its surface will be off by "
+            f"about {SWEEP_ERROR * long:.0f} mm; take an impulse, or of recordings import.compress"
         )
     for line in [] if follows() else fit_warnings(echoes, box, is_set=lower is not None):
         logger.warning("%s", line)
