@@ -306,19 +306,20 @@ def require_regular(path: Path) -> None:
 BEGINNINGS = {
     b"version https://git-lfs": "a pointer of Git LFS; fetch the file that it stands for",
     b"<!doctype html": "a web page",
+    b"<!DOCTYPE html": "a web page",
     b"<html": "a web page",
-    b"pk\3\4": "a ZIP archive, as of a spreadsheet",
+    b"PK\3\4": "a ZIP archive, as of a spreadsheet",
     b"\x1f\x8b": "compressed by gzip",
-    b"\x89hdf": "HDF5",
-    b"matlab ": "a MATLAB file; save it as HDF5 (h5create, h5write) with pings along the "
+    b"\x89HDF": "HDF5",
+    b"MATLAB ": "a MATLAB file; save it as HDF5 (h5create, h5write) with pings along the "
     "last dimension, or see the formats sonotracelab and sononerf-matlab",
-    b"flac": "FLAC",
-    b"oggs": "Ogg",
-    b"form": "AIFF",
+    b"fLaC": "FLAC",
+    b"OggS": "Ogg",
+    b"FORM": "AIFF",
     b"caff": "CAF",
     b"riff\x2e\x91\xcf\x11": "Wave64",
 }
-"""What a file is by its first bytes, in lower case: what others end up with under a wrong name."""
+"""What a file is by its first bytes: what others end up with under a wrong name."""
 
 
 def none_such(path: Path, kind: str) -> InputError:
@@ -331,5 +332,5 @@ def none_such(path: Path, kind: str) -> InputError:
 def name_by_content(path: Path) -> str:
     """Return what a file is by its first bytes; empty if that is none of the usual mistakes."""
     with path.open("rb") as file:
-        start = file.read(100).lower()
+        start = file.read(100)
     return next((name for first, name in BEGINNINGS.items() if start.startswith(first)), "")

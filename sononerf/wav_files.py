@@ -161,6 +161,5 @@ def _true_rate(
     """Return the sampling rate that the metadata state, if it is not that of the header."""
     begin, size = chunks.get(b"guan", (0, 0))
     text = content[begin : begin + min(size, 100_000)].tobytes().decode("utf-8", errors="replace")
-    fields = dict(re.findall(r"(?m)^\s*(TE|Samplerate)\s*:\s*(\d+)", text))
-    true = int(fields.get("Samplerate", rate * max(int(fields.get("TE", 1)), 1)))
-    return true if true not in (0, rate) else None
+    stated = re.search(r"(?m)^\s*Samplerate\s*:\s*(\d+)", text)
+    return int(stated[1]) if stated and int(stated[1]) not in (0, rate) else None

@@ -101,8 +101,8 @@ def _root(
         raise typer.Exit(SettingsError.exit_code)
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
     for handler in logging.getLogger().handlers:
-        handler.filters = [one for one in handler.filters if not isinstance(one, _Once)]
-        handler.addFilter(_Once())
+        if type(handler) is logging.StreamHandler:  # the one of this command line
+            handler.filters = [_Once()]
 
 
 class _Once(logging.Filter):
