@@ -13,7 +13,7 @@ from typing import Any
 
 from sononerf import storage
 from sononerf.errors import InputError
-from sononerf.storage import name_by_content, none_such, require_regular
+from sononerf.storage import name_by_content, require_regular, wrong_kind
 
 Display = Callable[..., Any]
 _displays: dict[str, Display] = {}
@@ -61,7 +61,7 @@ def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: larger than {MOST_BYTES} bytes; no table of poses")
         if name_by_content(path):
-            raise none_such(path, "table of poses")
+            raise wrong_kind(path, "table of poses")
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sononerf.errors import InputError
 from sononerf.numerics import Floats
-from sononerf.storage import none_such
+from sononerf.storage import wrong_kind
 
 NUMERIC = {"double", "single", "logical", "char"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
@@ -39,7 +39,7 @@ def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
                 if name in group
             }
     if not start.startswith(b"MATLAB 5.0 MAT-file"):
-        raise none_such(path, "MATLAB file of version 5 or 7.3")
+        raise wrong_kind(path, "MATLAB file of version 5 or 7.3")
     try:
         content = scipy.io.loadmat(path, variable_names=list(names), struct_as_record=True)
     except (NotImplementedError, MemoryError) as error:
@@ -155,7 +155,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
             yield file
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         if not h5py.is_hdf5(path):
-            raise none_such(path, "HDF5 file") from None
+            raise wrong_kind(path, "HDF5 file") from None
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged, truncated, or no HDF5 file ({said})") from None
 

@@ -322,7 +322,7 @@ BEGINNINGS = {
 """What a file is by its first bytes: what others end up with under a wrong name."""
 
 
-def none_such(path: Path, kind: str) -> InputError:
+def wrong_kind(path: Path, kind: str) -> InputError:
     """Return the error of a file that is not of a kind; it says what the file is, if that shows."""
     name = name_by_content(path)
     said = f"; it is {name}" if name else ", whatever its name says"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.errors import InputError
-from sononerf.storage import none_such, require_regular
+from sononerf.storage import require_regular, wrong_kind
 
 logger = logging.getLogger("sononerf")
 
@@ -58,7 +58,7 @@ def read_wav(path: Path) -> Wav:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if content[:4].tobytes() not in FORMS or content[8:12].tobytes() != b"WAVE":
-        raise none_such(path, "WAV file")
+        raise wrong_kind(path, "WAV file")
     chunks = _chunks(path, content)
     if b"data" not in chunks or chunks.get(b"fmt ", (0, 0))[1] < 16:
         name = "samples (data)" if b"fmt " in chunks else "format (fmt)"
@@ -76,8 +76,8 @@ def read_wav(path: Path) -> Wav:
     width = -(-bits // 8)
     if align not in (0, width * channels):
         raise InputError(
-            f"{path}: its header states {channels} channels of {bits} bits, and {align} bytes for "
-            "each moment (block align); write the file anew"
+            f"{path}: its header states {channels} channels of {bits} bits and a block align of "
+            f"{align} bytes, which contradict each other; write the file anew"
         )
     if (form, width) not in KINDS:
         raise InputError(
@@ -109,7 +109,9 @@ def _chunks(path: Path, content: NDArray[np.uint8]) -> dict[bytes, tuple[int, in
         if name == b"data" and size == UNSTATED and chunks.get(b"ds64", (0, 0))[1] >= 16:
             size = int(content[chunks[b"ds64"][0] :][8:16].view("<u8")[0])
         if name == b"data" and name in chunks:
-            raise InputError(f"{path}: holds two series of samples (data); write the file anew")
+            raise InputError(
+                f"{path}: holds two chunks of samples (data), expected one; write the file anew"
+            )
         chunks.setdefault(name, (at, size))
         at += size
         if size % 2 and at < len(content) and content[at] == 0:  # some leave the padding out

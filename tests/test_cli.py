@@ -861,5 +861,5 @@ def test_a_deleted_working_folder_is_one_line(tmp_path):
 def test_what_a_sweep_cannot_tell_is_said(at_home, tmp_path):
     options = ["fit.max_steps=2", "reconstruction.refine=false", "--output", tmp_path / "run"]
     said = done("fit", SMOKE, "call.preset=fm_3ms", *options).err
-    assert "a point's echo is 53 mm long in range, that of an impulse 6 mm" in said
-    assert "off by about 8 mm" in said
+    assert "the echo of a point is 53 mm long in range; that of an impulse is 6 mm" in said
+    assert "wrong by about 8 mm" in said

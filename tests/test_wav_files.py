@@ -101,8 +101,8 @@ def test_floats_and_other_widths_mean_the_same(tmp_path):
         ({"head": form(channels=0)}, "and 0 channels"),
         ({"head": b""}, "holds no format"),
         ({"kind": b"FORM"}, "no WAV file; it is AIFF"),
-        ({"after": chunk(b"data", PCM16)}, "two series of samples"),
-        ({"head": form()[:20] + b"\3\0" + form()[22:]}, "of 16 bits, and 3 bytes"),
+        ({"after": chunk(b"data", PCM16)}, "two chunks of samples"),
+        ({"head": form()[:20] + b"\3\0" + form()[22:]}, "of 16 bits and a block align of 3 bytes"),
     ],
 )
 def test_a_header_that_contradicts_the_file_is_named(tmp_path, given, words):

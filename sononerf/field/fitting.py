@@ -116,15 +116,15 @@ def usable_accelerator(accelerator: str) -> str:
     return "cpu" if accelerator == "auto" and not there else accelerator
 
 
-def require_lightning(**hardware: Any) -> None:
-    """Refuse what Lightning's Trainer refuses.
+def make_trainer(**options: Any) -> lightning.Trainer:
+    """Return a Trainer of Lightning, whose options are those of its constructor.
 
     Raises:
-        SettingsError: With Lightning's words.
+        SettingsError: If Lightning refuses an option, with its words.
     """
+    quiet_lightning()
     try:
-        quiet_lightning()
-        lightning.Trainer(**hardware, accelerator="cpu", logger=False, enable_checkpointing=False)
+        return lightning.Trainer(**options)
     except (ValueError, MisconfigurationException) as error:
         raise SettingsError(f"Lightning: {' '.join(str(error).split())}") from None
 
@@ -175,13 +175,11 @@ def fit(
         model = EchoModule.for_echoes(echoes, options=options)
     elif options is not None:
         raise SettingsError("options: the model has its own; give them to EchoModule.for_echoes")
-    quiet_lightning()
-    require_lightning(precision=precision, strategy=strategy)
-    trainer = lightning.Trainer(
+    trainer = make_trainer(
         accelerator=accelerator,
         devices=devices,
         num_nodes=num_nodes,
-        precision=precision,  # type: ignore[arg-type]  # it checks the word itself
+        precision=precision,
         strategy=strategy,
         max_epochs=model.options.epochs,
         max_steps=model.options.max_steps or -1,

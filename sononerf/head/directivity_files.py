@@ -36,7 +36,7 @@ from sononerf.errors import InputError
 from sononerf.head.directivity import FADE, MOST_RECEIVERS, Directivity, unit_vectors
 from sononerf.matlab_files import read_mat
 from sononerf.numerics import Floats
-from sononerf.storage import name_by_content, none_such, require_regular
+from sononerf.storage import name_by_content, require_regular, wrong_kind
 
 logger = logging.getLogger("sononerf")
 
@@ -109,7 +109,7 @@ def read_csv(path: Path) -> Directivity:
     receiver has every direction at every frequency, once, in any order.
     """
     if name_by_content(path):
-        raise none_such(path, "SOFA file, .mat file or table of gains")
+        raise wrong_kind(path, "SOFA file, .mat file or table of gains")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

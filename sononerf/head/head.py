@@ -66,8 +66,8 @@ class PointEcho:
     # (F, W) or None: The same of each row, which the window is the sum of; None where all rows are
     # about alike. If low rows swell more slowly, an echo without high frequencies does so too
     rows: Floats | None = None
-    # (L,): Power in front of it over its own, from near to far, as long as the call lasts; the same
-    # spacing. None of an impulse, which has none
+    # (L,) or None: Power of the precursors divided by that of the echo, at the same spacing, from
+    # the nearest one on, as far as the call is long; None for an impulse
     precursors: Floats | None = None
 
     @classmethod
@@ -90,19 +90,19 @@ class PointEcho:
 
     @property
     def tail(self) -> float:
-        """Distance by which it goes on behind its own range and resolution, at -20 dB, m.
+        """Distance by which it is louder than -20 dB beyond its resolution, m.
 
-        Nothing of an impulse; of a call of harmonics that overlap it holds their later echoes.
+        Zero for an impulse. Of harmonics that overlap, the later echoes lie within it.
         """
         loud = np.flatnonzero(self.window >= 0.01 * self.window.max())
         behind = (int(loud[-1]) - (len(self.window) - 1) / 2.0) * self.spacing
         return max(behind - self.resolution, 0.0)
 
     def ahead(self, step: float) -> Floats:
-        """Return the precursors (L,) of slices a step (m) apart.
+        """Return the power of the precursors (L,) in slices that are a step (m) apart.
 
-        Of those before the echo itself the loudest within a resolution counts: echoes of several
-        points add up.
+        Each is that of the loudest precursor within a range resolution, because the precursors of
+        several points add up.
         """
         if self.precursors is None:
             return np.zeros(0)
@@ -165,7 +165,8 @@ class Head(NotebookRepr):
             "file", "file": "call.wav"}``.
         air: Speed of sound and absorption: section ``air``, such as ``{"temperature_c": 20}``.
         spectrogram: Filters, hop, range limits, Hz and m: section ``spectrogram``, such as
-            ``{"frequency_min": 20e3, "frequency_max": 90e3, "range_max": 1.0}``.
+            ``{"frequency_min": 20e3, "frequency_max": 90e3, "range_max": 1.0}``. Where they are not
+            set, band, window, hop and FFT follow from the call.
         noise: Noise of the receivers: section ``noise``, such as ``{"snr_db": 20}``.
         support: A rigid plane that the body stands on, m, world frame: section ``support``, such as
             ``{"point": (0, 0, -0.05)}``; none by default.

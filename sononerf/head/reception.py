@@ -179,7 +179,8 @@ logger = logging.getLogger("sononerf")
 
 MAX_WINDOW_RATIO = 2.0  # ratio of a window to the best one, or its inverse, that is worth a warning
 FAINT_POWER = 1e-3
-"""Fraction of a point echo's power that may lie beyond the times at which it is followed."""
+"""Fraction of a point echo's power, no unit, that is cut off at its two ends: 30 dB below all of
+it. A kernel that also holds the rest is ten times as long, and as slow."""
 MAX_OTHER_ECHO = 4.0
 """Largest magnitude of another harmonic's echo of a point over that of its own: 12 dB."""
 
@@ -223,11 +224,11 @@ def best_window(call: CallSettings, spectrogram: SpectrogramSettings) -> int:
 
 
 def suited(call: CallSettings, spectrogram: SpectrogramSettings) -> SpectrogramSettings:
-    """Return the analysis, with the keys that were not set chosen for a sweep.
+    """Return the analysis; the keys that were not set are chosen for the call.
 
-    The band is what the loudest harmonic covers, of equally loud ones the highest, which sweeps
-    fastest: where two overlap every point is heard twice. The window keeps a point echo shortest,
-    and the hop is a sixteenth of it, as for an impulse.
+    The band is that of the loudest harmonic. If several are equally loud, it is that of the
+    highest one, which sweeps fastest. (Where harmonics overlap, every point is heard twice.) The
+    window is the one that makes a point echo shortest, and the hop is a sixteenth of the window.
     """
     given = spectrogram.model_fields_set
     if call.kind == "impulse":
@@ -309,9 +310,9 @@ def _point_echo(call: CallSettings, spectrogram: SpectrogramSettings, side: floa
 
 
 def precursors(call: CallSettings, spectrogram: SpectrogramSettings) -> Floats:
-    """Return the power of a point echo in front of its top over that of the top, one per sample.
+    """Return the power of a point's precursors (L,), divided by that of its echo; one per sample.
 
-    A row hears a little of the frequencies that a sweep emits before its own.
+    Each row also hears, faintly, the frequencies that the sweep emits before the row's own.
     """
     side = (
         row_filters(spectrogram).envelope.shape[1]

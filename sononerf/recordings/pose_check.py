@@ -78,7 +78,7 @@ XYZW = (QUATERNION[-1], *QUATERNION[:-1])
 """Columns that hold w, x, y, z if numbers in the order x, y, z, w have the names w, x, y, z."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 AXES = "other axes of the head, "
-"""Stands in the name of a convention between what it is and the settings that mend it."""
+"""Part of the name of such a convention; the settings that correct it follow."""
 MOST_NAMED = 3
 """Number of conventions, at most, that a message names."""
 AIM_FLOOR = np.radians(20.0)
@@ -182,15 +182,21 @@ def _head_axes(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
         for name, mirror in (("", np.eye(3)), ("a left-handed frame and ", MIRROR)):
             own = {"axes": mirror @ world, "head_axes": turn @ mirror @ head}
             rows = {key: (matrix.round(6) + 0.0).tolist() for key, matrix in own.items()}
-            advice = " ".join(f"import.{key}={matrix}" for key, matrix in rows.items())
-            advice = f"import.frame=own {advice}".replace(", ", ",").replace(".0", "")
-            # Ears do not tell well whether the head stands upright in a mirrored world.
+            advice = "import.frame=own " + " ".join(
+                f"import.{key}=[{','.join(_row(row) for row in matrix)}]"
+                for key, matrix in rows.items()
+            )
+            # Ears hardly tell a mirrored world with the head upside down from the stated one.
             ahead_and_left = (turn @ mirror)[:2, :2]
             if not np.array_equal(ahead_and_left, np.eye(2)):
                 readings[f"{name}{AXES}{advice}"] = to_poses(
                     columns, settings.model_copy(update={"frame": "own", **rows})
                 )
     return readings
+
+
+def _row(row: list[float]) -> str:
+    return f"[{','.join(f'{value:g}' for value in row)}]"
 
 
 def _with(columns: Columns, values: dict[str, Floats]) -> Columns:
@@ -460,7 +466,8 @@ def _is_unit(name: str) -> bool:
 HINTS = {
     "inverse rotations": "the rotations lead from the world to the head (import.inverse=rotations)",
     "inverse poses": "rotations and places lead from the world to the head (import.inverse=poses)",
-    "compass heading": "yaw is a compass heading, from y towards x (write 90 degrees less it)",
+    "compass heading": "yaw is a compass heading, clockwise from y (replace it by 90 degrees "
+    "minus yaw)",
     "quaternion order": "the quaternion's scalar is its last number (columns qx, qy, qz, qw)",
     "the row after": "each ping belongs to the pose one row later; pings and poses are off by one",
     "the row before": "each ping belongs to the pose one row earlier; pings and poses are off "
@@ -476,16 +483,14 @@ HINTS = {
 
 
 def _axes_named(name: str) -> int:
-    """Return how much is to be changed: nothing about axes, those of the head, or all."""
+    """Return 1 for other axes of the head, 2 in a left-handed frame as well, and 0 otherwise."""
     return (AXES in name) + (AXES in name and not name.startswith(AXES))
 
 
 def _message(names: list[str]) -> str:
     hints = " or ".join(dict.fromkeys(_hint(name) for name in names[:MOST_NAMED]))
     more = len(names) - MOST_NAMED
-    further = (
-        f"; {more} others explain them as well, such as other rolls of the head" if more > 0 else ""
-    )
+    further = f"; {more} other conventions explain them as well" if more > 0 else ""
     return f"another convention of poses explains the first echoes better: {hints}{further}"
 
 

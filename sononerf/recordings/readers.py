@@ -21,7 +21,7 @@ from sononerf.numerics import Floats
 from sononerf.recordings.pose_tables import EULER, PLACE, Columns, columns_of, read_table
 from sononerf.recordings.recording import AUDIO, Recording, read_audio
 from sononerf.settings.sections import ImportSettings
-from sononerf.storage import none_such
+from sononerf.storage import wrong_kind
 
 HDF5 = (".h5", ".hdf5", ".hdf")
 SUFFIXES = (".npz", *HDF5)
@@ -49,7 +49,7 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
         with path.open("rb") as file:
             start = file.read(6)
             if start[:2] != b"PK" and start != b"\x93NUMPY":
-                raise none_such(path, ".npz")
+                raise wrong_kind(path, ".npz")
             file.seek(0)
             arrays_read = np.load(file, allow_pickle=False)
             if isinstance(arrays_read, np.ndarray):

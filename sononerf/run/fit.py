@@ -31,7 +31,7 @@ from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import save_weights
 from sononerf.field.datamodule import EchoDataModule
-from sononerf.field.fitting import StepCost, require_lightning, step_cost, usable_accelerator
+from sononerf.field.fitting import StepCost, make_trainer, step_cost, usable_accelerator
 from sononerf.field.fitting import fit as fit_field
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses, aim_fault
@@ -72,8 +72,8 @@ GRID_SIDE = 8
 
 
 SWEEP_ERROR = 1.0 / 7.0
-"""Error of a surface over the length of a point's echo under a sweep, no unit: 0.14 to 0.22 for
-three spheres and 0.10 to 0.15 for another body under sweeps of 0.4 to 3 ms (``docs/calls.md``)."""
+"""Error of a surface divided by the length of a point's echo, no unit: 0.14 to 0.22 for three
+spheres, and 0.10 to 0.15 for another body, under sweeps of 0.4 to 3 ms (``docs/calls.md``)."""
 
 
 def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
@@ -288,7 +288,6 @@ def fit(
     progress = progress or Progress(quiet=True)
     run = Run(path)
     usable_accelerator(accelerator)
-    require_lightning(precision=precision, strategy=strategy)
     settings = with_store(settings)
     head = head_of(settings)
     module_for(settings, head, None, 1.0)  # unknown names and options are refused at once
@@ -299,6 +298,8 @@ def fit(
         "precision": precision,
         "strategy": strategy,
     }
+    if not follows():  # what Lightning refuses is told before minutes of simulation
+        make_trainer(**hardware, logger=False, enable_checkpointing=False)
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
         echoes = Echoes(_wait_for_store(settings, path), head)
@@ -374,9 +375,10 @@ def _prepared(
     if echoes.head.call.kind != "impulse":
         long, short = (1e3 * one.resolution for one in (echoes.head, echoes.head.of_impulse()))
         progress.say(
-            f"call: a point's echo is {long:.0f} mm long in range, that of an impulse {short:.0f} "
-            "mm: parts of a body that are nearer in range merge, and its surface will be off by "
-            f"about {SWEEP_ERROR * long:.0f} mm; take an impulse, or of recordings import.compress"
+            f"call: the echo of a point is {long:.0f} mm long in range; that of an impulse is "
+            f"{short:.0f} mm long. Parts of a body that are nearer to one another merge, and the "
+            f"surface will be wrong by about {SWEEP_ERROR * long:.0f} mm. Simulate an impulse; for "
+            "recordings set import.compress=true"
         )
     for line in [] if follows() else fit_warnings(echoes, box, is_set=lower is not None):
         logger.warning("%s", line)

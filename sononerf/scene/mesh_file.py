@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sononerf.errors import InputError
 from sononerf.numerics import Floats, Ints
 from sononerf.scene.gltf import read_gltf, strip_triangles
-from sononerf.storage import name_by_content, none_such
+from sononerf.storage import name_by_content, wrong_kind
 
 LARGEST_FILE = 1_000_000_000  # bytes
 LARGEST_MESH = 20_000_000  # triangles
@@ -95,7 +95,7 @@ def read_mesh(path: Path | str) -> MeshFile:
         stated = READERS[kind](data)
     except Exception as error:  # whatever the bytes of a stranger lead to
         if name_by_content(Path(path)):
-            raise none_such(Path(path), f"{kind.upper()} file") from None
+            raise wrong_kind(Path(path), f"{kind.upper()} file") from None
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from None
         text = " ".join(str(error).split())[:200]

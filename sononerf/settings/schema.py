@@ -175,7 +175,8 @@ class SpectrogramSettings(Section):
 
     Of the kind ``stft`` a symmetric Hamming ``window`` and a padded ``fft``; of ``gammatone`` a
     bank of ``channels`` on a logarithmic frequency axis, each ``q`` times as high as it is wide.
-    Window, hop and FFT follow from the band where they are not set.
+    Where they are not set, window, hop and FFT follow from the band, and all of these and the band
+    itself follow from a call that is not an impulse.
     """
 
     sampling_rate: Positive = 1e6

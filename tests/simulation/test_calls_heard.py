@@ -24,5 +24,8 @@ def test_first_echoes_and_region_are_those_of_the_body(preset):
     out = np.linalg.norm(emitters - PLACE, axis=1)[:, None]
     true = (out + np.linalg.norm(receivers - PLACE, axis=2)) / 2.0 - RADIUS
     assert np.abs(onsets.first - true[onsets.poses]).max() < 0.25 * head.resolution
-    size = np.diff(heard.region.box(), axis=0)[0]
+    box = heard.region.box()
+    assert (box[0] < ball.bounds[0]).all()
+    assert (box[1] > ball.bounds[1]).all()
+    size = np.diff(box, axis=0)[0]
     assert (size < 2.0 * 2.0 * RADIUS + 2.0 * head.resolution).all()
